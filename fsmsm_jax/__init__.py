@@ -1,0 +1,2 @@
+"""fsmsm_jax."""
+from fsmsm_jax import geometry as geometry

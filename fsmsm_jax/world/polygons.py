@@ -1,0 +1,57 @@
+"""Polygon maps: worlds of straight walls, in which ray casting is exact.
+
+The thesis's environments are closed outlines of points. A `PolygonMap` keeps
+them as segments, start to end, so that several outlines (a room and the pillars
+in it) are one array and a ray meets each segment by two lines of algebra.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+__all__ = ["PolygonMap"]
+
+
+class PolygonMap(eqx.Module):
+    """A world of straight walls; build one with `PolygonMap.from_outlines`."""
+
+    start: Float[Array, "segments 2"]
+    """First end of each wall, map frame [m]."""
+    end: Float[Array, "segments 2"]
+    """Second end of each wall, map frame [m]."""
+
+    @classmethod
+    def from_outlines(cls, *outlines: Sequence | np.ndarray) -> "PolygonMap":
+        """Walls along closed outlines, each an ordered (vertices, 2) array [m].
+
+        The last vertex is joined to the first; do not repeat it.
+
+        Raises:
+            ValueError: no outline, fewer than three vertices, a wrong shape, or
+                a coordinate that is not finite.
+
+        Example:
+            >>> room = PolygonMap.from_outlines([[1, 1], [5, 1], [5, 4], [1, 4]])
+            >>> room.start.shape
+            (4, 2)
+        """
+        if not outlines:
+            raise ValueError("a PolygonMap needs at least one outline of (vertices, 2) points")
+        starts, ends = [], []
+        for number, outline in enumerate(outlines):
+            vertices = np.asarray(outline, float)
+            if vertices.ndim != 2 or vertices.shape[1] != 2 or len(vertices) < 3:
+                raise ValueError(
+                    f"outline {number} must be (vertices ≥ 3, 2) points, got {vertices.shape}"
+                )
+            if not np.isfinite(vertices).all():
+                raise ValueError(f"outline {number} holds a coordinate that is not finite")
+            starts.append(vertices)
+            ends.append(np.roll(vertices, -1, axis=0))
+        return cls(
+            start=jnp.asarray(np.concatenate(starts), float),
+            end=jnp.asarray(np.concatenate(ends), float),
+        )
