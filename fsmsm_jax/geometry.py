@@ -18,31 +18,36 @@ def wrap(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """The same angle [rad] in [−π, π).
 
     Example:
-        >>> float(wrap(jnp.asarray(3.5 * jnp.pi)).round(4))
-        -1.5708
+        >>> round(float(wrap(jnp.asarray(3.5 * jnp.pi))), 3)
+        -1.571
     """
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
-def compose(pose_a_b: Float[Array, "3"], pose_b_c: Float[Array, "3"]) -> Float[Array, "3"]:
+def compose(
+    pose_a_b: Float[Array, "3"], pose_b_c: Float[Array, "3"]
+) -> Float[Array, "3"]:
     """The pose of c in a, from the pose of b in a and of c in b.
 
     Example:
-        >>> compose(jnp.array([1.0, 2.0, jnp.pi / 2]), jnp.array([1.0, 0.0, 0.0])).round(3)
-        Array([1.   , 3.   , 1.571], dtype=float32)
+        >>> turned = jnp.array([1.0, 2.0, jnp.pi / 2])
+        >>> [round(v, 3) for v in compose(turned, jnp.array([1.0, 0.0, 0.0])).tolist()]
+        [1.0, 3.0, 1.571]
     """
     xy = transform_points(pose_a_b, pose_b_c[:2])
     return jnp.concatenate([xy, wrap(pose_a_b[2:] + pose_b_c[2:])])
 
 
 def inverse(pose_a_b: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The pose of a in b, so that `compose(pose, inverse(pose))` is the identity."""
+    """The pose of a in b; composed with the pose of b in a it is the identity."""
     x, y, theta = pose_a_b
     c, s = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([-(c * x + s * y), s * x - c * y, wrap(-theta)])
 
 
-def between(pose_a_b: Float[Array, "3"], pose_a_c: Float[Array, "3"]) -> Float[Array, "3"]:
+def between(
+    pose_a_b: Float[Array, "3"], pose_a_c: Float[Array, "3"]
+) -> Float[Array, "3"]:
     """The pose of c in b, from two poses in the same frame a."""
     return compose(inverse(pose_a_b), pose_a_c)
 

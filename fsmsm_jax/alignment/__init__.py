@@ -1,0 +1,25 @@
+"""One scan against another: which way to turn, where to step, how well they agree."""
+
+from fsmsm_jax.alignment.spectrum import (
+    Spectrum as Spectrum,
+    masked_squared_difference as masked_squared_difference,
+    squared_difference as squared_difference,
+)
+from fsmsm_jax.alignment.orientation import (
+    Orientation as Orientation,
+    fourier_mellin as fourier_mellin,
+    fourier_mellin_masked as fourier_mellin_masked,
+    heading_costs as heading_costs,
+)
+from fsmsm_jax.alignment.position import (
+    Translation as Translation,
+    masked_position_correction as masked_position_correction,
+    position_correction as position_correction,
+    translate as translate,
+)
+from fsmsm_jax.alignment.caer import (
+    caer as caer,
+    caer_at as caer_at,
+    caer_per_ray as caer_per_ray,
+    truncated_caer_per_ray as truncated_caer_per_ray,
+)

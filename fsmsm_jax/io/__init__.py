@@ -1,0 +1,3 @@
+"""Logs on disk become arrays; `read_scans` is the only door most people need."""
+
+from fsmsm_jax.io.logs import ScanLog as ScanLog, read_scans as read_scans

@@ -1,4 +1,5 @@
 """What a lidar sees: sensors, virtual scans, and real ones brought into form."""
 
 from fsmsm_jax.sensing.lidar import Lidar as Lidar, Scan as Scan
+from fsmsm_jax.sensing.panorama import panorama as panorama
 from fsmsm_jax.sensing.raycast import raycast as raycast

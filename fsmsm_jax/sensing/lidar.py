@@ -14,6 +14,8 @@ Bearings are in the sensor frame [rad], counter-clockwise, in the order in which
 they came: a negative increment, [0, 2π) or [−π, π] layouts all work.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,7 +42,7 @@ class Scan(eqx.Module):
     @classmethod
     def from_ranges(
         cls,
-        ranges: np.ndarray,
+        ranges: Sequence | np.ndarray | Array,
         angle_min: float,
         angle_increment: float,
         range_min: float = 0.0,
@@ -66,10 +68,14 @@ class Scan(eqx.Module):
             >>> scan.valid.tolist(), scan.echo.tolist()
             ([True, True, False, False], [True, False, False, False])
         """
-        if not (np.isfinite(angle_min) and np.isfinite(angle_increment) and angle_increment != 0):
+        if not (
+            np.isfinite(angle_min)
+            and np.isfinite(angle_increment)
+            and angle_increment != 0
+        ):
             raise ValueError(
-                "angle_min and angle_increment must be finite and the increment not 0, got "
-                f"{angle_min} and {angle_increment}"
+                "angle_min and angle_increment must be finite and the increment not 0, "
+                f"got {angle_min} and {angle_increment}"
             )
         bearings = angle_min + angle_increment * np.arange(np.size(ranges))
         return cls.from_bearings(ranges, bearings, range_min, range_max)
@@ -77,8 +83,8 @@ class Scan(eqx.Module):
     @classmethod
     def from_bearings(
         cls,
-        ranges: np.ndarray,
-        bearings: np.ndarray,
+        ranges: Sequence | np.ndarray | Array,
+        bearings: Sequence | np.ndarray | Array,
         range_min: float = 0.0,
         range_max: float = 30.0,
     ) -> "Scan":
@@ -91,26 +97,32 @@ class Scan(eqx.Module):
         ranges = np.asarray(ranges, float)
         bearings = np.asarray(bearings, float)
         if ranges.ndim != 1 or ranges.size == 0:
-            raise ValueError(f"a scan is one non-empty row of ranges, got shape {ranges.shape}")
+            raise ValueError(
+                f"a scan is one non-empty row of ranges, got shape {ranges.shape}"
+            )
         if bearings.shape != ranges.shape:
             raise ValueError(
-                f"one bearing a range: expected shape {ranges.shape}, got {bearings.shape}"
+                f"one bearing a range: expected shape {ranges.shape}, "
+                f"got {bearings.shape}"
             )
         if not np.isfinite(bearings).all():
             raise ValueError(
-                f"{np.sum(~np.isfinite(bearings))} bearings are not finite; every ray needs one"
+                f"{np.sum(~np.isfinite(bearings))} bearings are not finite; "
+                "every ray needs one"
             )
         if not (np.isfinite(range_max) and 0 <= range_min < range_max):
             raise ValueError(
-                f"range limits must be 0 ≤ range_min < range_max, got {range_min} and {range_max}"
+                "range limits must be 0 ≤ range_min < range_max, "
+                f"got {range_min} and {range_max}"
             )
         with np.errstate(invalid="ignore"):
             valid = (ranges >= range_min) & (ranges > 0)
             echo = valid & (ranges < range_max)
         if not valid.any():
             raise ValueError(
-                f"none of the {ranges.size} rays holds information (all NaN, −inf, 0 or under "
-                f"range_min = {range_min}); check the units (metres) and the driver"
+                f"none of the {ranges.size} rays holds information (all NaN, −inf, 0 "
+                f"or under range_min = {range_min}); check the units (metres) and the "
+                "driver"
             )
         return cls(
             ranges=jnp.asarray(np.where(echo, ranges, range_max), float),
@@ -122,9 +134,26 @@ class Scan(eqx.Module):
 
     @property
     def points(self) -> Float[Array, "rays 2"]:
-        """End points in the sensor frame [m]; only those of `echo` rays mean anything."""
+        """End points in the sensor frame [m]; they mean something where `echo`."""
         return self.ranges[..., None] * jnp.stack(
             [jnp.cos(self.bearings), jnp.sin(self.bearings)], axis=-1
+        )
+
+    def thin(self, rays: int) -> "Scan":
+        """A scan of `rays` rays spread evenly over the informative ones.
+
+        Fixed shape, so that scans of any length meet one compiled function; rays
+        repeat evenly where the scan has fewer informative ones than asked for.
+        """
+        informative_first = jnp.argsort(~self.valid, stable=True)
+        count = jnp.maximum(jnp.sum(self.valid), 1)
+        chosen = informative_first[(jnp.arange(rays) * count) // rays]
+        return Scan(
+            ranges=self.ranges[chosen],
+            bearings=self.bearings[chosen],
+            valid=self.valid[chosen],
+            echo=self.echo[chosen],
+            range_max=self.range_max,
         )
 
 
@@ -140,7 +169,7 @@ class Lidar(eqx.Module):
     dropout: Float[Array, ""]
     """Probability that a ray returns nothing at all (invalid)."""
     outliers: Float[Array, ""]
-    """Probability that something unmapped stands in the way: a range uniform in (0, r)."""
+    """Probability that something unmapped stands somewhere along the ray."""
 
     @classmethod
     def create(
@@ -165,13 +194,21 @@ class Lidar(eqx.Module):
         if rays < 3:
             raise ValueError(f"a lidar needs at least 3 rays, got {rays}")
         if not 0 < field_of_view <= 2 * np.pi + 1e-9:
-            raise ValueError(f"field_of_view must lie in (0, 2π] rad, got {field_of_view}")
+            raise ValueError(
+                f"field_of_view must lie in (0, 2π] rad, got {field_of_view}"
+            )
         if not (np.isfinite(range_max) and range_max > 0 and noise >= 0):
-            raise ValueError(f"expected range_max > 0, noise ≥ 0, got {range_max} and {noise}")
+            raise ValueError(
+                f"expected range_max > 0, noise ≥ 0, got {range_max} and {noise}"
+            )
         if not (0 <= dropout <= 1 and 0 <= outliers <= 1):
-            raise ValueError(f"probabilities must lie in [0, 1], got {dropout} and {outliers}")
+            raise ValueError(
+                f"probabilities must lie in [0, 1], got {dropout} and {outliers}"
+            )
         full = field_of_view > 2 * np.pi - 1e-6
-        bearings = np.linspace(-field_of_view / 2, field_of_view / 2, rays, endpoint=not full)
+        bearings = np.linspace(
+            -field_of_view / 2, field_of_view / 2, rays, endpoint=not full
+        )
         return cls(
             bearings=jnp.asarray(bearings, float),
             range_max=jnp.asarray(range_max, float),

@@ -91,14 +91,15 @@ def _first_hit(world, position, headings, range_max):
 
 
 def _hit_segments(world, position, headings, range_max):
-    """Nearest of the intersections with all walls: o + r d = a + s (b − a), 0 ≤ s ≤ 1."""
-    d = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=-1)[:, None, :]
-    wall = world.end - world.start
-    to_start = world.start - position
-    cross = d[..., 0] * wall[:, 1] - d[..., 1] * wall[:, 0]
+    """Nearest intersection with any wall: o + r d = a + s (b − a), 0 ≤ s ≤ 1."""
+    along = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=-1)
+    dx, dy = along[:, :1], along[:, 1:]  # rays down, walls across
+    wx, wy = (world.end - world.start).T[:, None, :]
+    ax, ay = (world.start - position[None, :]).T[:, None, :]
+    cross = dx * wy - dy * wx
     safe = jnp.where(cross == 0, 1.0, cross)
-    r = (to_start[:, 0] * wall[:, 1] - to_start[:, 1] * wall[:, 0]) / safe
-    s = (to_start[:, 0] * d[..., 1] - to_start[:, 1] * d[..., 0]) / safe
+    r = (ax * wy - ay * wx) / safe
+    s = (ax * dy - ay * dx) / safe
     # A hair of tolerance closes the corner between two walls against rounding.
     slack = 8 * jnp.finfo(r.dtype).eps
     met = (cross != 0) & (s >= -slack) & (s <= 1 + slack) & (r >= 0)
@@ -106,8 +107,8 @@ def _hit_segments(world, position, headings, range_max):
     nearest = jnp.argmin(r, axis=1)
     r = jnp.take_along_axis(r, nearest[:, None], axis=1)[:, 0]
     hit = r < range_max
-    normal = jnp.stack([wall[nearest, 1], -wall[nearest, 0]], axis=-1)
-    return jnp.where(hit, r, range_max), _towards_sensor(normal, d[:, 0], hit)
+    normal = jnp.stack([wy[0, nearest], -wx[0, nearest]], axis=-1)
+    return jnp.where(hit, r, range_max), _towards_sensor(normal, along, hit)
 
 
 def _hit_cells(world, position, headings, range_max):
@@ -121,7 +122,7 @@ def _hit_cells(world, position, headings, range_max):
     hit = inside & (t < far)
     ranges = jnp.where(hit, t * world.resolution, range_max)
 
-    # Slope half a cell inside the wall, where both faces of a thin wall do not cancel.
+    # Slope half a cell before the wall, where both faces of a thin wall do not cancel.
     d = jnp.stack([jnp.cos(local), jnp.sin(local)], axis=-1)
     x, y = (o + (t[:, None] - 0.5) * d).T - 0.5
     gradient = _bilinear_gradient(world.surface, x, y)
@@ -142,7 +143,7 @@ def _towards_sensor(normal, along, hit: Bool[Array, "rays"]):
 
 
 def _bilinear_gradient(field, x, y):
-    """Gradient of a field, central differences over one cell, at (column, row) points."""
+    """Central differences of a field over one cell, at (column, row) points."""
     height, width = field.shape
 
     def at(x, y):
@@ -181,17 +182,13 @@ def _march(clearance, x, y, headings, far):
 @_march.def_vmap
 def _march_flat(axis_size, in_batched, clearance, *rays):
     """Under `vmap`, more rays of the same kind: flatten, so that no lane idles."""
+    spread = [
+        a if b else jnp.broadcast_to(a, (axis_size, *a.shape))
+        for a, b in zip(rays, in_batched[1:], strict=True)
+    ]
     if in_batched[0]:  # many worlds: one after the other
-        spread = [
-            a if b else jnp.broadcast_to(a, (axis_size, *a.shape))
-            for a, b in zip(rays, in_batched[1:], strict=True)
-        ]
         out = jax.lax.map(lambda args: _march(*args), (clearance, *spread))
     else:
-        spread = [
-            a if b else jnp.broadcast_to(a, (axis_size, *a.shape))
-            for a, b in zip(rays, in_batched[1:], strict=True)
-        ]
         flat = _march(clearance, *(a.reshape(-1) for a in spread))
         out = tuple(a.reshape(axis_size, -1) for a in flat)
     return out, (True, True, True)
@@ -200,7 +197,7 @@ def _march_flat(axis_size, in_batched, clearance, *rays):
 def _start(clearance, x, y, headings, far):
     """Per-ray constants (x, y, dx, dy, far) and state (t, column, row)."""
     dx, dy = jnp.cos(headings), jnp.sin(headings)
-    tiny = jnp.finfo(dx.dtype).tiny ** 0.5  # an axis-parallel ray never meets that axis's faces
+    tiny = jnp.finfo(dx.dtype).tiny ** 0.5  # so that no ray is parallel to an axis
     dx = jnp.where(jnp.abs(dx) < tiny, tiny, dx)
     dy = jnp.where(jnp.abs(dy) < tiny, tiny, dy)
     height, width = clearance.shape
@@ -212,7 +209,9 @@ def _start(clearance, x, y, headings, far):
 def _free_radius(clearance, column, row):
     """Clearance of the cell; the ring of padding shifts indices by one."""
     index = (row + 1) * clearance.shape[1] + column + 1
-    return clearance.reshape(-1).at[index].get(mode="promise_in_bounds").astype(jnp.int32)
+    return (
+        clearance.reshape(-1).at[index].get(mode="promise_in_bounds").astype(jnp.int32)
+    )
 
 
 def _walking(clearance, ray, state):
@@ -230,9 +229,15 @@ def _hop(clearance, ray, state):
     sideways = t_column < t_row
     t_exit = jnp.minimum(t_column, t_row)
     # The crossed index is set exactly; the other one may not leave the box by rounding.
-    near_column = jnp.clip(jnp.floor(x + t_exit * dx).astype(int), column - k + 1, column + k - 1)
-    near_row = jnp.clip(jnp.floor(y + t_exit * dy).astype(int), row - k + 1, row + k - 1)
-    next_column = jnp.where(sideways, jnp.where(right, column + k, column - k), near_column)
+    near_column = jnp.clip(
+        jnp.floor(x + t_exit * dx).astype(jnp.int32), column - k + 1, column + k - 1
+    )
+    near_row = jnp.clip(
+        jnp.floor(y + t_exit * dy).astype(jnp.int32), row - k + 1, row + k - 1
+    )
+    next_column = jnp.where(
+        sideways, jnp.where(right, column + k, column - k), near_column
+    )
     next_row = jnp.where(sideways, near_row, jnp.where(up, row + k, row - k))
     go = (k > 0) & (t < far)
     return (
@@ -274,7 +279,10 @@ def _march_compacting(clearance, ray, state, hops):
         )
 
     walked = jax.lax.fori_loop(
-        0, -(-place[-1] // short), block, tuple(jnp.zeros(8 * short, a.dtype) for a in state)
+        0,
+        -(-place[-1] // short),
+        block,
+        tuple(jnp.zeros(8 * short, a.dtype) for a in state),
     )
     return tuple(
         jnp.where(walking, late.at[place - 1].get(mode="clip"), now)

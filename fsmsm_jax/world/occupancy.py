@@ -13,6 +13,8 @@ nearest occupied cell: end points of a scan should find it small) and `surface`
 (blurred occupancy, whose gradient is the wall's normal).
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -49,9 +51,9 @@ class OccupancyGrid(eqx.Module):
     @classmethod
     def from_cells(
         cls,
-        cells: np.ndarray,
+        cells: Sequence | np.ndarray | Array,
         resolution: float,
-        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        origin: Sequence | np.ndarray | Array = (0.0, 0.0, 0.0),
         *,
         unknown: str = "transparent",
     ) -> "OccupancyGrid":
@@ -72,15 +74,25 @@ class OccupancyGrid(eqx.Module):
         """
         cells = np.asarray(cells)
         if cells.ndim != 2 or cells.size == 0:
-            raise ValueError(f"cells must be a non-empty (height, width) array, got {cells.shape}")
+            raise ValueError(
+                f"cells must be a non-empty (height, width) array, got {cells.shape}"
+            )
         if not (np.isfinite(cells).all() and cells.min() >= -1 and cells.max() <= 100):
-            raise ValueError("cells must lie in −1 (unknown), 0..100 (per cent occupied)")
+            raise ValueError(
+                "cells must lie in −1 (unknown), 0..100 (per cent occupied)"
+            )
         if not (np.isfinite(resolution) and resolution > 0):
-            raise ValueError(f"resolution must be a positive number of metres, got {resolution}")
+            raise ValueError(
+                f"resolution must be a positive number of metres, got {resolution}"
+            )
         if np.shape(origin) != (3,) or not np.isfinite(np.asarray(origin, float)).all():
-            raise ValueError(f"origin must be three finite numbers [x, y, yaw], got {origin}")
+            raise ValueError(
+                f"origin must be three finite numbers [x, y, yaw], got {origin}"
+            )
         if unknown not in ("transparent", "opaque"):
-            raise ValueError(f"unknown must be 'transparent' or 'opaque', got {unknown!r}")
+            raise ValueError(
+                f"unknown must be 'transparent' or 'opaque', got {unknown!r}"
+            )
 
         occupied = cells >= _OCCUPIED_PERCENT
         stops = occupied | (cells < 0) if unknown == "opaque" else occupied
@@ -88,7 +100,9 @@ class OccupancyGrid(eqx.Module):
             ~np.pad(stops, 1, constant_values=True), metric="chessboard"
         )
         if occupied.any():
-            distance = ndimage.distance_transform_edt(~occupied) * resolution
+            distance = (
+                np.asarray(ndimage.distance_transform_edt(~occupied)) * resolution
+            )
         else:
             distance = np.full(cells.shape, np.hypot(*cells.shape) * resolution)
         surface = ndimage.gaussian_filter(occupied.astype(np.float32), _SURFACE_BLUR)
@@ -96,7 +110,7 @@ class OccupancyGrid(eqx.Module):
             cells=jnp.asarray(cells, jnp.int8),
             resolution=jnp.asarray(resolution, float),
             origin=jnp.asarray(origin, float),
-            clearance=jnp.asarray(np.minimum(clearance, 255), jnp.uint8),
+            clearance=jnp.asarray(np.minimum(np.asarray(clearance), 255), jnp.uint8),
             distance=jnp.asarray(distance, float),
             surface=jnp.asarray(surface, float),
         )
@@ -118,8 +132,25 @@ class OccupancyGrid(eqx.Module):
 
     def to_cells(self, points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Map-frame points [m] in (column, row) units; cell (0, 0) covers [0, 1)²."""
-        return geometry.transform_points(geometry.inverse(self.origin), points) / self.resolution
+        return (
+            geometry.transform_points(geometry.inverse(self.origin), points)
+            / self.resolution
+        )
 
     def to_map(self, cells: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-        """(column, row) coordinates, 0.5 being a cell's centre, as map-frame points [m]."""
+        """(column, row) units, 0.5 being a cell's centre, as map-frame points [m]."""
         return geometry.transform_points(self.origin, cells * self.resolution)
+
+    def distance_at(self, points: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+        """Distance [m] from map-frame points to the nearest obstacle, interpolated.
+
+        Differentiable; points off the map take the value of the nearest edge.
+        """
+        height, width = self.cells.shape
+        x, y = jnp.moveaxis(self.to_cells(points) - 0.5, -1, 0)
+        x, y = jnp.clip(x, 0, width - 1.001), jnp.clip(y, 0, height - 1.001)
+        i, j = x.astype(int), y.astype(int)
+        u, v = x - i, y - j
+        lower = (1 - u) * self.distance[j, i] + u * self.distance[j, i + 1]
+        upper = (1 - u) * self.distance[j + 1, i] + u * self.distance[j + 1, i + 1]
+        return (1 - v) * lower + v * upper

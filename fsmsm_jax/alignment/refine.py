@@ -1,0 +1,151 @@
+"""From nearly right to exactly right, and how sure: descent with exact derivatives.
+
+Two residuals serve two purposes. The distance from each *end point* to the nearest
+wall has a wide basin: it pulls a guess that is half a metre off onto the walls,
+whatever the sensor cannot see. The difference of *ranges*, real against virtual,
+knows which wall a ray should meet first and is the sensor's own measurement: near
+the truth its Gauss-Newton step is as precise as the physics allows, and its Fisher
+information is the Cramér–Rao bound (A. Censi, ICRA 2007).
+
+Both are iterated as Gauss-Newton steps reweighted by Geman and McClure's kernel,
+w = (1 + (e/s)²)⁻², whose scale s shrinks from step to step (graduated
+non-convexity): people and moved furniture lose their vote as the pose settles.
+Everything is written for one pose; `vmap` refines many candidates at once.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from fsmsm_jax import geometry
+from fsmsm_jax.sensing.lidar import Scan
+from fsmsm_jax.sensing.raycast import raycast
+from fsmsm_jax.world.occupancy import OccupancyGrid
+from fsmsm_jax.world.polygons import PolygonMap
+
+__all__ = ["covariance", "descend_end_points", "polish_ranges"]
+
+_DAMPING = 1e-2  # share of the rays' weight added to the diagonal of the end-point step
+_LONGEST_STEP = 0.3  # [m] and [rad] per iteration: the linearisation holds no farther
+_STEEPEST = 3.0  # cap of 1/|n·d|: at 70° and more the normal itself is uncertain
+_PRIOR_VARIANCE = (10.0**2, 10.0**2, 3.14**2, 0.05**2)  # of what nobody measured
+
+
+def descend_end_points(
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    scales: Float[Array, "steps"],
+) -> Float[Array, "3"]:
+    """Pull the scan's end points onto the nearest walls.
+
+    Args:
+        world: the map.
+        scan: the real scan, n rays; only its echoes take part.
+        pose: first guess [x, y, θ] of the lidar in the map; half a metre and some ten
+            degrees may be missing.
+        scales: kernel scale s of each step [m], shrinking; its length is the number
+            of steps.
+
+    Returns:
+        The refined pose of the lidar in the map.
+    """
+
+    def distances(pose):
+        return world.distance_at(geometry.transform_points(pose, scan.points))
+
+    def step(pose, scale):
+        e, J = distances(pose), jax.jacfwd(distances)(pose)
+        w = jnp.where(scan.echo, _geman_mcclure(e, scale), 0.0)
+        return _gauss_newton(pose, -e, J, w, _DAMPING), None
+
+    return jax.lax.scan(step, pose, scales)[0]
+
+
+def polish_ranges(
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    scales: Float[Array, "steps"],
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Robust Gauss-Newton on real minus virtual ranges, by the cast's exact derivative.
+
+    A map made from scans draws its walls some centimetres thick, and every virtual
+    ray stops at the near face: too early, by b / |n·d|. That would push the pose
+    away from whatever the sensor faces, so b is estimated along with the pose
+    (3 to 4 cm on maps of real buildings, nothing on true ones).
+
+    Args:
+        world: the map.
+        scan: the real scan, n rays; echoes that the map explains take part.
+        pose: guess [x, y, θ] of the lidar in the map, within some centimetres.
+        scales: kernel scale s of each step [m]; its length is the number of steps.
+
+    Returns:
+        The refined pose of the lidar in the map, and the thickness b [m].
+    """
+
+    def step(state, scale):
+        e, J, known = _range_residuals(world, scan, state[:3], state[3])
+        w = jnp.where(known, _geman_mcclure(e, scale) / J[:, 3] ** 2, 0.0)
+        return _gauss_newton(state, e, J, w, 1e-3), None
+
+    state = jax.lax.scan(step, jnp.append(pose, 0.0), scales)[0]
+    return state[:3], state[3]
+
+
+def covariance(
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    thickness: float | Float[Array, ""] = 0.0,
+    floor: float = 0.01,
+) -> Float[Array, "3 3"]:
+    """Covariance of a pose [m, m, rad] from the Fisher information of the ranges.
+
+    The ranges' noise is read off the residuals (1.48 times their median size, at
+    least `floor` [m]); rays farther off than three times that carry no information.
+    The walls' `thickness` counts as unknown. A direction that no ray measures (along
+    a corridor) keeps a variance of (10 m)² or (π rad)², so degeneracy is reported
+    and never hidden.
+
+    Reference:
+        A. Censi, "On achievable accuracy for range-finder localization", ICRA 2007.
+    """
+    e, J, known = _range_residuals(world, scan, pose, jnp.asarray(thickness))
+    e = jnp.abs(e) / J[:, 3]
+    sigma = 1.4826 * jnp.nanmedian(jnp.where(known, e, jnp.nan))
+    sigma = jnp.where(jnp.any(known), jnp.maximum(sigma, floor), floor)
+    w = jnp.where(known & (e < 3 * sigma), 1.0, 0.0) / (sigma * J[:, 3]) ** 2
+    prior = jnp.diag(1 / jnp.asarray(_PRIOR_VARIANCE, pose.dtype))
+    return jnp.linalg.inv((J * w[:, None]).T @ J + prior)[:3, :3]
+
+
+def _range_residuals(world, scan, pose, thickness):
+    """Real minus virtual ranges, their Jacobian, and which rays both worlds know.
+
+    Columns of the Jacobian: x, y, θ and the walls' thickness, whose entry is 1/|n·d|,
+    the length of ∂r/∂(x, y).
+    """
+    cast = lambda pose: raycast(world, pose, scan.bearings, scan.range_max)
+    virtual, J = cast(pose), jax.jacfwd(cast)(pose)
+    slant = jnp.clip(jnp.linalg.norm(J[:, :2], axis=1), 1.0, _STEEPEST)
+    e = scan.ranges - virtual - thickness * slant
+    known = scan.echo & (virtual < scan.range_max)
+    return e, jnp.concatenate([J, slant[:, None]], axis=1), known
+
+
+def _geman_mcclure(e, scale):
+    return 1 / (1 + (e / scale) ** 2) ** 2
+
+
+def _gauss_newton(state, e, J, w, damping):
+    """One weighted least-squares step of e ≈ J δ, damped and of bounded length.
+
+    The state is a pose [x, y, θ], or one with further unknowns behind it.
+    """
+    information = (J * w[:, None]).T @ J
+    damped = information + (damping * jnp.sum(w) + 1e-3) * jnp.eye(len(state))
+    step = jnp.linalg.solve(damped, (J * w[:, None]).T @ e)
+    state = state + jnp.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+    return state.at[2].set(geometry.wrap(state[2]))

@@ -1,0 +1,294 @@
+"""The map is scanned once, not once per query.
+
+A `ScanAtlas` lays a square lattice over the map's free space and keeps, of each
+position, the panoramic scan that a lidar would take there. Turning the sensor only
+shifts that scan, so one panorama stands for all headings: hypotheses are positions.
+
+Two spectra make a query a handful of FFTs:
+
+- `end_points`: the two-dimensional DFT of the map's likelihood field
+  exp(−d²/2σ²), d being the distance to the nearest wall. The product with the
+  spectrum of the scan's end points scores *every* lattice position at one heading.
+- `panoramas`: the one-dimensional DFTs of the panoramas, their ranges written as
+  phases e^{iω log(r + r₀)}. The product with the real panorama's spectrum scores
+  *every* heading at one position. As a phase each ray has weight one: a long ray
+  cannot outvote fifty short ones, as it does when metres are correlated.
+
+Building is chunked; what it will cost is said before (`memory_estimate`).
+"""
+
+import hashlib
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+from scipy import fft, ndimage
+from tqdm import tqdm
+
+from fsmsm_jax import geometry
+from fsmsm_jax.sensing.raycast import raycast
+from fsmsm_jax.world.occupancy import OccupancyGrid
+from fsmsm_jax.world.polygons import PolygonMap
+
+__all__ = ["AtlasConfig", "Lattice", "ScanAtlas", "build_atlas", "range_phases"]
+
+_FREQUENCY = 4.0  # ω: ranges that differ by a factor of two differ by 2.8 rad
+_OFFSET = 0.3  # r₀ [m]: below this, differences of range are clutter
+_CHUNK = 1024  # positions cast together
+
+
+class AtlasConfig(eqx.Module):
+    """How finely the map is scanned."""
+
+    spacing: float = eqx.field(static=True, default=0.25)
+    """Distance between lattice positions [m]."""
+    rays: int = eqx.field(static=True, default=180)
+    """Rays of each panorama."""
+    range_max: float = eqx.field(static=True, default=30.0)
+    """Longest range of the panoramas [m]."""
+    reach: float = eqx.field(static=True, default=12.0)
+    """End points farther than this from the sensor do not vote in the search [m]."""
+    softness: float = eqx.field(static=True, default=0.25)
+    """σ of the likelihood field [m]: about one spacing, so that no wall slips through."""
+    margin: float = eqx.field(static=True, default=1.0)
+    """How far into unknown space a sensor may stand [m]."""
+
+    def __check_init__(self):
+        """Refuse settings that no lattice can be built with."""
+        for name in ("spacing", "range_max", "reach", "softness"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number of metres: {value}")
+        if self.rays < 8 or self.margin < 0:
+            raise ValueError(
+                f"expected rays ≥ 8 and margin ≥ 0, got {self.rays} and {self.margin}"
+            )
+
+
+class Lattice(eqx.Module):
+    """A square lattice, turned with the map: node (row, column) is a place to stand."""
+
+    frame: Float[Array, "3"]
+    """Pose of the lattice's lower left corner in the map [m, m, rad]."""
+    allowed: Bool[Array, "rows columns"]
+    """Nodes where a sensor may stand."""
+    spacing: float = eqx.field(static=True)
+    """Distance between nodes [m]; node (0, 0) lies half of it inside the corner."""
+
+    def to_map(
+        self, row: Int[Array, "*batch"], column: Int[Array, "*batch"]
+    ) -> Float[Array, "*batch 2"]:
+        """Map-frame position [m] of nodes."""
+        offset = (jnp.stack([column, row], axis=-1) + 0.5) * self.spacing
+        return geometry.transform_points(self.frame, offset)
+
+
+class ScanAtlas(eqx.Module):
+    """A map scanned from a lattice of positions; build one with `build_atlas`."""
+
+    world: OccupancyGrid | PolygonMap
+    """The map itself."""
+    lattice: Lattice
+    """Where the map was scanned from."""
+    row_of: Int[Array, "rows columns"]
+    """Index into `panoramas` of each lattice node (0 where none may stand)."""
+    panoramas: Complex[Array, "positions rays"]
+    """DFT of e^{iω log(r + r₀)} of each panorama, ray n at map bearing −π + 2πn/rays."""
+    end_points: Complex[Array, "height half_width"]
+    """Half-spectrum of the zero-padded likelihood field."""
+    config: AtlasConfig = eqx.field(static=True)
+
+    @property
+    def padded_shape(self) -> tuple[int, int]:
+        """Size of the field whose spectrum `end_points` is."""
+        return _padded_shape(self.lattice.allowed.shape, self.config)
+
+    def save(self, path: str | Path) -> None:
+        """Write the atlas, less the map it belongs to, as an `.npz` file."""
+        with Path(path).open("wb") as file:
+            np.savez(
+                file,
+                fingerprint=np.asarray(_fingerprint(self.world)),
+                frame=self.lattice.frame,
+                allowed=self.lattice.allowed,
+                panoramas=self.panoramas,
+                end_points=self.end_points,
+                **{f"config_{k}": np.asarray(v) for k, v in vars(self.config).items()},
+            )
+
+    @classmethod
+    def load(cls, path: str | Path, world: OccupancyGrid | PolygonMap) -> "ScanAtlas":
+        """Read an atlas that was saved for this very map.
+
+        Raises:
+            ValueError: the file is missing or no atlas, or was built for another map.
+        """
+        names = list(AtlasConfig.__dataclass_fields__)
+        try:
+            with np.load(path) as saved:
+                fingerprint = str(saved["fingerprint"])
+                config = AtlasConfig(**{k: saved[f"config_{k}"].item() for k in names})
+                arrays = {
+                    k: saved[k] for k in ("frame", "allowed", "panoramas", "end_points")
+                }
+        except (OSError, KeyError, ValueError, EOFError) as error:
+            raise ValueError(
+                f"cannot read a scan atlas from {path} ({error}); "
+                "build it anew with build_atlas(world) and save it"
+            ) from error
+        if fingerprint != _fingerprint(world):
+            raise ValueError(
+                f"the atlas {path} was built for another map (or other settings of it); "
+                "load that map, or build a new atlas for this one with build_atlas"
+            )
+        lattice = Lattice(
+            jnp.asarray(arrays["frame"]), jnp.asarray(arrays["allowed"]), config.spacing
+        )
+        return cls(
+            world=world,
+            lattice=lattice,
+            row_of=_row_of(arrays["allowed"]),
+            panoramas=jnp.asarray(arrays["panoramas"]),
+            end_points=jnp.asarray(arrays["end_points"]),
+            config=config,
+        )
+
+
+def memory_estimate(
+    world: OccupancyGrid | PolygonMap, config: AtlasConfig = AtlasConfig()
+) -> int:
+    """Bytes that the atlas of this world will hold, without building it."""
+    allowed = _lattice(world, config).allowed
+    height, width = _padded_shape(allowed.shape, config)
+    return 8 * (int(allowed.sum()) * config.rays + height * (width // 2 + 1))
+
+
+def build_atlas(
+    world: OccupancyGrid | PolygonMap,
+    config: AtlasConfig = AtlasConfig(),
+    *,
+    progress: bool = False,
+) -> ScanAtlas:
+    """Scan the map from every lattice position.
+
+    Args:
+        world: the map.
+        config: how finely.
+        progress: whether to draw a progress bar on stderr.
+
+    Raises:
+        ValueError: no lattice position lies in free space.
+
+    Example:
+        >>> import fsmsm_jax as fj
+        >>> room = fj.PolygonMap.from_outlines([[1, 1], [5, 1], [5, 4], [1, 4]])
+        >>> atlas = build_atlas(room, AtlasConfig(spacing=0.5, margin=0.0))
+        >>> atlas.panoramas.shape
+        (48, 180)
+    """
+    lattice = _lattice(world, config)
+    row, column = np.nonzero(np.asarray(lattice.allowed))
+    position = lattice.to_map(jnp.asarray(row), jnp.asarray(column))
+    bearings = panorama_bearings(config.rays)
+
+    @jax.jit
+    def scan_from(world, positions):
+        poses = jnp.pad(positions, ((0, 0), (0, 1)))
+        cast = lambda pose: raycast(world, pose, bearings, config.range_max)
+        return jnp.fft.fft(range_phases(jax.vmap(cast)(poses)))
+
+    count = len(row)
+    padded = jnp.pad(position, ((0, -count % _CHUNK), (0, 0)), mode="edge")
+    chunks = []
+    for chunk in tqdm(
+        jnp.split(padded, len(padded) // _CHUNK),
+        desc=f"atlas of {count} positions, "
+        f"{memory_estimate(world, config) / 1e6:.0f} MB",
+        unit="chunk",
+        disable=not progress,
+    ):
+        chunks.append(scan_from(world, chunk))
+    return ScanAtlas(
+        world=world,
+        lattice=lattice,
+        row_of=_row_of(np.asarray(lattice.allowed)),
+        panoramas=jnp.concatenate(chunks)[:count],
+        end_points=_end_point_spectrum(world, lattice, config),
+        config=config,
+    )
+
+
+def range_phases(ranges: Float[Array, "*batch rays"]) -> Complex[Array, "*batch rays"]:
+    """Ranges [m] as unit phases e^{iω log(r + r₀)}: every ray has the same vote."""
+    return jnp.exp(1j * _FREQUENCY * jnp.log(ranges + _OFFSET))
+
+
+def panorama_bearings(rays: int) -> Float[Array, "rays"]:
+    """Bearings −π + 2πn/rays [rad] of a panoramic scan."""
+    return -jnp.pi + 2 * jnp.pi * jnp.arange(rays) / rays
+
+
+def _lattice(world, config) -> Lattice:
+    """The nodes over the known part of the map from which a lidar could see it."""
+    if isinstance(world, OccupancyGrid):
+        free, occupied = np.asarray(world.free), np.asarray(world.occupied)
+        resolution = float(world.resolution)
+        rows, columns = (np.nonzero((free | occupied).any(axis=a))[0] for a in (1, 0))
+        if not free.any():
+            raise ValueError("the map has no free cell to stand on; check its thresholds")
+        corner = np.array([columns[0], rows[0]]) * resolution
+        size = (np.array([columns[-1], rows[-1]]) + 1) * resolution - corner
+        frame = geometry.compose(world.origin, jnp.asarray([*corner, 0.0], float))
+        to_free = ndimage.distance_transform_edt(~free) * resolution
+        stand = to_free <= config.spacing / 2  # any free spot near the node will do
+        stand |= np.asarray(world.unknown) & (to_free <= config.margin)
+    else:
+        corner = np.minimum(world.start.min(axis=0), world.end.min(axis=0))
+        size = np.asarray(jnp.maximum(world.start.max(axis=0), world.end.max(axis=0)))
+        size = size - corner
+        frame = jnp.asarray([*corner, 0.0], float)
+    shape = np.maximum(np.ceil(size / config.spacing - 1e-6).astype(int), 1)[::-1]
+    nodes = Lattice(frame, jnp.ones(tuple(shape), bool), config.spacing)
+    place = nodes.to_map(*(jnp.asarray(i) for i in np.indices(tuple(shape))))
+    if isinstance(world, OccupancyGrid):
+        column, row = np.moveaxis(np.floor(np.asarray(world.to_cells(place))), -1, 0)
+        row = np.clip(row.astype(int), 0, stand.shape[0] - 1)
+        allowed = stand[row, np.clip(column.astype(int), 0, stand.shape[1] - 1)]
+    else:
+        allowed = np.asarray(world.contains(place))
+    if not allowed.any():
+        raise ValueError(
+            f"no lattice position of spacing {config.spacing} m lies in free space; "
+            "choose a smaller spacing"
+        )
+    return Lattice(frame, jnp.asarray(allowed), config.spacing)
+
+
+def _end_point_spectrum(world, lattice, config):
+    rows, columns = lattice.allowed.shape
+    nodes = np.indices((rows, columns))
+    distance = world.distance_at(lattice.to_map(*(jnp.asarray(i) for i in nodes)))
+    likelihood = jnp.exp(-0.5 * (distance / config.softness) ** 2)
+    return jnp.fft.rfft2(likelihood, s=_padded_shape((rows, columns), config))
+
+
+def _padded_shape(shape, config) -> tuple[int, int]:
+    """Room for a scan's reach beyond the map, rounded up to lengths FFTs like."""
+    reach = int(np.ceil(config.reach / config.spacing)) + 2
+    rows, columns = (fft.next_fast_len(n + reach, real=True) for n in shape)
+    return int(rows), int(columns)
+
+
+def _row_of(allowed):
+    return jnp.asarray(np.maximum(np.cumsum(allowed) - 1, 0).reshape(allowed.shape))
+
+
+def _fingerprint(world) -> str:
+    """A digest of everything in the world that a virtual scan depends on."""
+    digest = hashlib.sha256(type(world).__name__.encode())
+    for leaf in jax.tree.leaves(world):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()

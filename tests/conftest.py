@@ -1,0 +1,29 @@
+"""Strictness and data for all tests.
+
+Rank promotion is an error here: `(n,) + (m, n)` is nearly always a forgotten axis.
+Hypothesis is made repeatable and patient (the first example pays for a compile).
+"""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+from hypothesis import settings
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+settings.register_profile(
+    "fixed", deadline=None, derandomize=True, database=None, max_examples=50
+)
+settings.load_profile("fixed")
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder of third-party recordings; tests that need it skip where it is absent."""
+    default = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("FSMSM_DATA", default))
+    if not folder.is_dir():
+        pytest.skip(f"no recordings at {folder}; point FSMSM_DATA at them")
+    return folder
