@@ -225,7 +225,8 @@ def _frame(ax: Axes, points: np.ndarray) -> None:
 def _known_cells(world: OccupancyGrid) -> np.ndarray:
     """(column, row) of free cells, without rows and columns that hold stray beams."""
     free = np.asarray(world.free)
-    columns, rows = (free.sum(axis=a) * world.resolution >= _MARGIN for a in (0, 1))
+    least = _MARGIN / float(world.resolution)
+    columns, rows = (free.sum(axis=axis) >= least for axis in (0, 1))
     known = np.argwhere(free & columns & rows[:, None])
     return (known if known.size else np.argwhere(free | True))[:, ::-1] + 0.5
 
@@ -255,7 +256,7 @@ def _scale_bar(ax: Axes) -> None:
     length = max(step * decade for step in (1, 2, 5) if step * decade <= width / 4)
     sizes = (f"{length:g} m", f"{100 * length:g} cm", f"{1000 * length:g} mm")
     x, y = ax.transLimits.inverted().transform((0.03, 0.03))
-    _note(ax, sizes[(length < 1) + (length < 0.01)], (x, y), (0, 3), INK, 7)
+    _note(ax, sizes[sum((length < 1, length < 0.01))], (x, y), (0, 3), INK, 7)
     ax.plot([x, x + length], [y, y], color=INK, lw=1.5, path_effects=_HALO, zorder=6)
 
 

@@ -28,6 +28,7 @@ __all__ = ["covariance", "descend_end_points", "polish_ranges"]
 _DAMPING = 1e-2  # share of the rays' weight added to the diagonal of the end-point step
 _LONGEST_STEP = 0.3  # [m] and [rad] per iteration: the linearisation holds no farther
 _STEEPEST = 3.0  # cap of 1/|n·d|: at 70° and more the normal itself is uncertain
+_SECTORS = 36  # runs of rays whose errors are taken as shared
 _PRIOR_VARIANCE = (10.0**2, 10.0**2, 3.14**2, 0.05**2)  # of what nobody measured
 
 
@@ -55,7 +56,8 @@ def descend_end_points(
         return world.distance_at(geometry.transform_points(pose, scan.points))
 
     def step(pose, scale):
-        e, J = distances(pose), jax.jacfwd(distances)(pose)
+        e, derivative = jax.linearize(distances, pose)
+        J = jax.vmap(derivative, out_axes=1)(jnp.eye(3, dtype=pose.dtype))
         w = jnp.where(scan.echo, _geman_mcclure(e, scale), 0.0)
         return _gauss_newton(pose, -e, J, w, _DAMPING), None
 
@@ -99,26 +101,44 @@ def covariance(
     scan: Scan,
     pose: Float[Array, "3"],
     thickness: float | Float[Array, ""] = 0.0,
-    floor: float = 0.01,
+    floor: float = 0.005,
 ) -> Float[Array, "3 3"]:
-    """Covariance of a pose [m, m, rad] from the Fisher information of the ranges.
+    """Covariance of a polished pose [m, m, rad], by the information of its ranges.
 
-    The ranges' noise is read off the residuals (1.48 times their median size, at
-    least `floor` [m]); rays farther off than three times that carry no information.
-    The walls' `thickness` counts as unknown. A direction that no ray measures (along
-    a corridor) keeps a variance of (10 m)² or (π rad)², so degeneracy is reported
-    and never hidden.
+    A⁻¹ B A⁻¹, where A = Σ J Jᵀ/σ² is the Fisher information and B the scatter of
+    the score: residuals are summed over `_SECTORS` runs of neighbouring rays before
+    they are squared, so that errors which neighbours share (a wall drawn askew, a
+    moved cabinet) count as one error and not as many that cancel. Were all errors
+    independent, B = A and the covariance would be the Cramér–Rao bound; it is never
+    reported smaller than that. σ is read off the residuals (1.48 times their median
+    size, at least `floor` [m]) and rays farther off than 3σ are left out. The walls'
+    thickness counts as unknown. A direction that no ray measures (along a corridor)
+    keeps a variance of (10 m)² or (π rad)²: degeneracy is reported, never hidden.
 
     Reference:
-        A. Censi, "On achievable accuracy for range-finder localization", ICRA 2007.
+        A. Censi, "On achievable accuracy for range-finder localization", ICRA 2007;
+        the cluster-robust sandwich is K.-Y. Liang and S. Zeger's, Biometrika 1986.
     """
     e, J, known = _range_residuals(world, scan, pose, jnp.asarray(thickness))
-    e = jnp.abs(e) / J[:, 3]
-    sigma = 1.4826 * jnp.nanmedian(jnp.where(known, e, jnp.nan))
+    e, J = e / J[:, 3], J / J[:, 3:]
+    sigma = 1.4826 * jnp.nanmedian(jnp.where(known, jnp.abs(e), jnp.nan))
     sigma = jnp.where(jnp.any(known), jnp.maximum(sigma, floor), floor)
-    w = jnp.where(known & (e < 3 * sigma), 1.0, 0.0) / (sigma * J[:, 3]) ** 2
+    used = (known & (jnp.abs(e) < 3 * sigma))[:, None]
+    J = jnp.where(used, J / sigma, 0.0)
     prior = jnp.diag(1 / jnp.asarray(_PRIOR_VARIANCE, pose.dtype))
-    return jnp.linalg.inv((J * w[:, None]).T @ J + prior)[:3, :3]
+    bound = jnp.linalg.inv(J.T @ J + prior)
+    score = J * jnp.where(used, e[:, None] / sigma, 0.0)
+    sector = (jnp.arange(len(e)) * _SECTORS) // len(e)
+    score = jax.ops.segment_sum(score, sector, _SECTORS)
+    scatter = score.T @ score * _SECTORS / (_SECTORS - 4)
+    shared = bound @ scatter @ bound
+    return (bound + _positive_part(shared - bound))[:3, :3]
+
+
+def _positive_part(matrix):
+    """The symmetric matrix less its negative eigenvalues."""
+    value, vector = jnp.linalg.eigh((matrix + matrix.T) / 2)
+    return (vector * jnp.maximum(value, 0.0)[None]) @ vector.T
 
 
 def _range_residuals(world, scan, pose, thickness):
@@ -128,7 +148,8 @@ def _range_residuals(world, scan, pose, thickness):
     the length of ∂r/∂(x, y).
     """
     cast = lambda pose: raycast(world, pose, scan.bearings, scan.range_max)
-    virtual, J = cast(pose), jax.jacfwd(cast)(pose)
+    virtual, derivative = jax.linearize(cast, pose)
+    J = jax.vmap(derivative, out_axes=1)(jnp.eye(3, dtype=pose.dtype))
     slant = jnp.clip(jnp.linalg.norm(J[:, :2], axis=1), 1.0, _STEEPEST)
     e = scan.ranges - virtual - thickness * slant
     known = scan.echo & (virtual < scan.range_max)

@@ -18,6 +18,7 @@ Building is chunked; what it will cost is said before (`memory_estimate`).
 """
 
 import hashlib
+import zipfile
 from pathlib import Path
 
 import equinox as eqx
@@ -43,15 +44,15 @@ _CHUNK = 1024  # positions cast together
 class AtlasConfig(eqx.Module):
     """How finely the map is scanned."""
 
-    spacing: float = eqx.field(static=True, default=0.25)
+    spacing: float = eqx.field(static=True, default=0.4)
     """Distance between lattice positions [m]."""
     rays: int = eqx.field(static=True, default=180)
     """Rays of each panorama."""
     range_max: float = eqx.field(static=True, default=30.0)
     """Longest range of the panoramas [m]."""
-    reach: float = eqx.field(static=True, default=12.0)
+    reach: float = eqx.field(static=True, default=15.0)
     """End points farther than this from the sensor do not vote in the search [m]."""
-    softness: float = eqx.field(static=True, default=0.25)
+    softness: float = eqx.field(static=True, default=0.35)
     """σ of the likelihood field [m]: about one spacing, so that no wall slips through."""
     margin: float = eqx.field(static=True, default=1.0)
     """How far into unknown space a sensor may stand [m]."""
@@ -134,7 +135,7 @@ class ScanAtlas(eqx.Module):
                 arrays = {
                     k: saved[k] for k in ("frame", "allowed", "panoramas", "end_points")
                 }
-        except (OSError, KeyError, ValueError, EOFError) as error:
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(
                 f"cannot read a scan atlas from {path} ({error}); "
                 "build it anew with build_atlas(world) and save it"
@@ -192,14 +193,6 @@ def build_atlas(
     lattice = _lattice(world, config)
     row, column = np.nonzero(np.asarray(lattice.allowed))
     position = lattice.to_map(jnp.asarray(row), jnp.asarray(column))
-    bearings = panorama_bearings(config.rays)
-
-    @jax.jit
-    def scan_from(world, positions):
-        poses = jnp.pad(positions, ((0, 0), (0, 1)))
-        cast = lambda pose: raycast(world, pose, bearings, config.range_max)
-        return jnp.fft.fft(range_phases(jax.vmap(cast)(poses)))
-
     count = len(row)
     padded = jnp.pad(position, ((0, -count % _CHUNK), (0, 0)), mode="edge")
     chunks = []
@@ -210,7 +203,7 @@ def build_atlas(
         unit="chunk",
         disable=not progress,
     ):
-        chunks.append(scan_from(world, chunk))
+        chunks.append(_scan_from(world, chunk, config))
     return ScanAtlas(
         world=world,
         lattice=lattice,
@@ -221,14 +214,18 @@ def build_atlas(
     )
 
 
+@jax.jit
+def _scan_from(world, positions, config):
+    """Spectra of the panoramas seen from a chunk of positions."""
+    bearings = -jnp.pi + 2 * jnp.pi * jnp.arange(config.rays) / config.rays
+    poses = jnp.pad(positions, ((0, 0), (0, 1)))
+    cast = lambda pose: raycast(world, pose, bearings, config.range_max)
+    return jnp.fft.fft(range_phases(jax.vmap(cast)(poses)))
+
+
 def range_phases(ranges: Float[Array, "*batch rays"]) -> Complex[Array, "*batch rays"]:
     """Ranges [m] as unit phases e^{iω log(r + r₀)}: every ray has the same vote."""
     return jnp.exp(1j * _FREQUENCY * jnp.log(ranges + _OFFSET))
-
-
-def panorama_bearings(rays: int) -> Float[Array, "rays"]:
-    """Bearings −π + 2πn/rays [rad] of a panoramic scan."""
-    return -jnp.pi + 2 * jnp.pi * jnp.arange(rays) / rays
 
 
 def _lattice(world, config) -> Lattice:
@@ -276,8 +273,12 @@ def _end_point_spectrum(world, lattice, config):
 
 
 def _padded_shape(shape, config) -> tuple[int, int]:
-    """Room for a scan's reach beyond the map, rounded up to lengths FFTs like."""
-    reach = int(np.ceil(config.reach / config.spacing)) + 2
+    """Room beyond the map, rounded up to lengths that FFTs like.
+
+    The correlation is circular: end points farther than this off the map come round
+    to its other side. Half the reach is enough, for a right pose has none out there.
+    """
+    reach = int(np.ceil(0.5 * config.reach / config.spacing)) + 2
     rows, columns = (fft.next_fast_len(n + reach, real=True) for n in shape)
     return int(rows), int(columns)
 

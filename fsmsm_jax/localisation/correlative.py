@@ -41,7 +41,7 @@ def rank_poses(
         atlas: the map's atlas.
         scan: the real scan; echoes within the atlas's reach vote.
         headings: how many headings to try, a multiple of 6 (static).
-        count: how many poses to return (static).
+        count: how many poses to return at most (static).
 
     Returns:
         Poses of the lidar in the map; the index of each into `atlas.panoramas`; the
@@ -55,20 +55,22 @@ def rank_poses(
 
     def best_of_sector(theta):
         image = jax.vmap(lambda t: _scan_image(atlas, scan, t))(theta)
-        spectrum = jnp.conj(jnp.fft.rfft2(image)) * atlas.end_points
+        spectrum = jnp.conj(jnp.fft.rfft2(image)) * atlas.end_points[None]
         score = jnp.fft.irfft2(spectrum, s=atlas.padded_shape)[:, :rows, :columns]
-        score = jnp.where(lattice.allowed, score, -2.0)
+        score = jnp.where(lattice.allowed[None], score, -2.0)
         score = jnp.pad(score, pad, constant_values=-2.0)
         # One integer holds score and place, for XLA's argmax is slow on the CPU.
         ticks = jnp.round(score * (1 << 20)).astype(jnp.int32) << 5
         k, i, j = (jnp.arange(n) for n in score.shape)
-        place = (k[:, None, None] * _BLOCK + i[:, None] % _BLOCK) * _BLOCK + j % _BLOCK
+        k, i, j = k[:, None, None], i[None, :, None], j[None, None, :]
+        place = (k * _BLOCK + i % _BLOCK) * _BLOCK + j % _BLOCK
         blocks = (ticks + place).reshape(
             _SECTOR, score.shape[1] // _BLOCK, _BLOCK, score.shape[2] // _BLOCK, _BLOCK
         )
         return blocks.max(axis=(0, 2, 4))
 
     best = jax.lax.map(best_of_sector, theta.reshape(-1, _SECTOR))
+    count = min(count, best.size)
     value, index = jax.lax.top_k(best.reshape(-1), count)
     sector, row, column = jnp.unravel_index(index, best.shape)
     place = value & 31
@@ -85,7 +87,9 @@ def _scan_image(atlas, scan, theta):
     spacing, reach = atlas.config.spacing, atlas.config.reach
     theta = theta - atlas.lattice.frame[2]
     near = scan.echo & (scan.ranges < reach)
-    weight = 1 / jnp.maximum(jnp.sum(near), 1)
+    # Far walls are hit by few rays and say more about the heading: weight √r.
+    weight = jnp.sqrt(jnp.clip(scan.ranges, 0.3, 10.0))
+    weight = weight / jnp.maximum(jnp.sum(jnp.where(near, weight, 0.0)), 1e-6)
     direction = jnp.stack(
         [jnp.cos(theta + scan.bearings), jnp.sin(theta + scan.bearings)], axis=-1
     )

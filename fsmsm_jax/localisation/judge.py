@@ -8,8 +8,10 @@ So each ray is asked for its likelihood instead, a mixture that bounds its say:
 
 r − v compares ranges, d is the end point's distance to the nearest wall (a grazing
 ray may be a metre too long and still end on the right wall), and ε is what remains
-for rays that fit neither: more if the ray is too short (someone stood in the way)
-than if it is too long (it passed through a wall).
+for rays that fit neither: most if the ray ends in space that nobody has mapped, more
+if it is too short (someone stood in the way) than if it is too long (it passed
+through a wall). Near things are hit by many rays at once and move more often than
+far walls, so rays count by the fourth root of their range.
 
 `trust` is the verdict: the best pose must explain the scan, be fixed in all
 directions, and leave every distinct rival behind.
@@ -28,9 +30,10 @@ from fsmsm_jax.world.polygons import PolygonMap
 
 __all__ = ["Evidence", "explain", "trust"]
 
-_SIGMA = 0.15  # [m]: map and sensor errors of a ray that the map does explain
-_TOO_SHORT, _TOO_LONG = 0.15, 0.05  # ε: something unmapped, or through a wall
-_NO_ECHO_WEIGHT = 0.3  # glass, black things and sky make missing echoes poor witnesses
+_SIGMA = 0.1  # [m]: map and sensor errors of a ray that the map does explain
+_UNMAPPED, _TOO_SHORT, _TOO_LONG = 0.3, 0.1, 0.05  # ε, by what may have happened
+_NO_ECHO_WEIGHT = 0.1  # glass, black things and sky make missing echoes poor witnesses
+_THICKEST = 0.06  # [m]: walls drawn thicker than this are another place's walls
 _EXPLAINED = 0.3  # [m]: a ray this close to the map, in range or at its end, is explained
 
 
@@ -42,28 +45,48 @@ class Evidence(NamedTuple):
     explained: Float[Array, ""]
     """Share of the valid rays that the map explains."""
     caer_per_ray: Float[Array, ""]
-    """Mean |real − virtual range| over the valid rays [m]."""
+    """Mean |real − virtual range| where sensor and map both see something [m]."""
 
 
 def explain(
-    world: OccupancyGrid | PolygonMap, scan: Scan, pose: Float[Array, "3"]
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    thickness: float | Float[Array, ""] = 0.0,
 ) -> Evidence:
-    """How well the map explains the scan, seen from a pose [m, m, rad]."""
+    """How well the map explains the scan, seen from a pose [m, m, rad].
+
+    Args:
+        world: the map.
+        scan: the real scan.
+        pose: where the lidar may have been.
+        thickness: how much too early virtual rays stop [m], as `polish_ranges` says.
+    """
     virtual = raycast(world, pose, scan.bearings, scan.range_max)
     e = scan.ranges - virtual
-    d = world.distance_at(geometry.transform_points(pose, scan.points))
-    by_range = jnp.exp(-0.5 * (e / _SIGMA) ** 2)
+    end = geometry.transform_points(pose, scan.points)
+    d = world.distance_at(end)
+    true_e = jnp.where(scan.echo, e - jnp.clip(thickness, 0.0, _THICKEST), e)
+    by_range = jnp.exp(-0.5 * (true_e / _SIGMA) ** 2)
     by_end = jnp.exp(-0.5 * (d / _SIGMA) ** 2)
     rest = jnp.where(e < 0, _TOO_SHORT, _TOO_LONG)
+    rest = jnp.where(world.unknown_at(end), _UNMAPPED, rest)
     log_p = jnp.where(
         scan.echo,
         jnp.log(0.5 * by_range + 0.5 * by_end + rest),
         _NO_ECHO_WEIGHT * jnp.log(by_range + 0.1),
     )
     fits = (jnp.abs(e) < _EXPLAINED) | (scan.echo & (d < _EXPLAINED))
-    rays = jnp.maximum(jnp.sum(scan.valid), 1)
-    mean = lambda value: jnp.sum(jnp.where(scan.valid, value, 0.0)) / rays
-    return Evidence(mean(log_p), mean(fits), mean(jnp.abs(e)))
+    say = jnp.where(scan.valid, jnp.clip(scan.ranges, 0.3, 10.0) ** 0.25, 0.0)
+    both = scan.echo & (virtual < scan.range_max)
+    mean = lambda value, rays: (
+        jnp.sum(jnp.where(rays, value, 0.0)) / jnp.maximum(jnp.sum(rays), 1)
+    )
+    return Evidence(
+        score=jnp.sum(say * log_p) / jnp.maximum(jnp.sum(say), 1e-6),
+        explained=mean(fits, scan.valid),
+        caer_per_ray=mean(jnp.abs(e), both),
+    )
 
 
 def trust(

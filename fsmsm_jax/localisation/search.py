@@ -43,7 +43,7 @@ class SearchConfig(eqx.Module):
     """Headings of the exhaustive search, a multiple of 6."""
     ranked: int = eqx.field(static=True, default=1024)
     """Lattice poses that the panoramas turn and rank again."""
-    descended: int = eqx.field(static=True, default=128)
+    descended: int = eqx.field(static=True, default=192)
     """Candidates that descend on their end points."""
     polished: int = eqx.field(static=True, default=32)
     """Distinct candidates polished by their ranges."""
@@ -63,7 +63,7 @@ class Candidates(NamedTuple):
     scores: Float[Array, "candidates"]
     """Mean log-likelihood of a ray; higher is better, −inf marks a duplicate."""
     caer_per_ray: Float[Array, "candidates"]
-    """Mean |real − virtual range| [m]."""
+    """Mean |real − virtual range| where sensor and map both see something [m]."""
 
 
 class Localisation(NamedTuple):
@@ -74,7 +74,7 @@ class Localisation(NamedTuple):
     covariance: Float[Array, "3 3"]
     """Its covariance, from the Fisher information of the ranges [m, m, rad]²."""
     caer_per_ray: Float[Array, ""]
-    """Mean |real − virtual range| over the valid rays [m]."""
+    """Mean |real − virtual range| where sensor and map both see something [m]."""
     explained: Float[Array, ""]
     """Share of the valid rays that the map explains."""
     confident: Bool[Array, ""]
@@ -162,7 +162,8 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
 
     poses, row, score = rank_poses(atlas, ranking_scan, config.headings, config.ranked)
     poses, similarity = _turn(atlas, scan, poses, row)
-    best = jax.lax.top_k(score + 0.5 * similarity, config.descended)[1]
+    count = min(config.descended, len(poses))
+    best = jax.lax.top_k(score + 0.5 * similarity, count)[1]
 
     scales = jnp.array([0.5, 0.4, 0.3, 0.25, 0.2, 0.2])
     descend = lambda pose: descend_end_points(world, descent_scan, pose, scales)
@@ -172,14 +173,14 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
 
     scales = jnp.array([0.5, 0.3, 0.2, 0.2])
     polish = lambda pose: polish_ranges(world, ranking_scan, pose, scales)
-    poses, _ = jax.vmap(polish)(poses)
-    score = _judge(world, ranking_scan, poses).score
+    poses, thickness = jax.vmap(polish)(poses)
+    score = _judge(world, ranking_scan, poses, thickness).score
     poses, score = _distinct(poses, score, config.reported, 0.3, 0.25)
 
     scales = jnp.array([0.2, 0.15, 0.1, 0.1])
     polish = lambda pose: polish_ranges(world, scan, pose, scales)
     poses, thickness = jax.vmap(polish)(poses)
-    evidence = _judge(world, scan, poses)
+    evidence = _judge(world, scan, poses, thickness)
     score = jnp.where(jnp.isneginf(score), score, evidence.score)
     order = jnp.argsort(-score)
     poses, score, thickness = poses[order], score[order], thickness[order]
@@ -210,10 +211,11 @@ def _turn(atlas, scan, poses, row):
     rays = atlas.config.rays
     real = panorama(scan, rays)
     phases = jnp.where(real.valid, range_phases(real.ranges), 0.0)
-    spectrum = jnp.conj(jnp.fft.fft(phases)) * atlas.panoramas[row]
+    spectrum = jnp.conj(jnp.fft.fft(phases))[None] * atlas.panoramas[row]
     q = jnp.fft.ifft(spectrum).real / jnp.maximum(jnp.sum(real.valid), 1)
     step = 2 * jnp.pi / rays
-    window = jnp.round(poses[:, 2] / step).astype(int)[:, None] + jnp.arange(-2, 3)
+    window = jnp.round(poses[:, 2] / step).astype(int)[:, None]
+    window = window + jnp.arange(-2, 3)[None]
     near = jnp.take_along_axis(q, window % rays, axis=1)
     best = jnp.argmax(near, axis=1, keepdims=True)
     theta = jnp.take_along_axis(window, best, axis=1)[:, 0] * step
@@ -221,15 +223,16 @@ def _turn(atlas, scan, poses, row):
     return turned, jnp.take_along_axis(near, best, axis=1)[:, 0]
 
 
-def _judge(world, scan, poses) -> Evidence:
-    return jax.vmap(lambda pose: explain(world, scan, pose))(poses)
+def _judge(world, scan, poses, thickness=None) -> Evidence:
+    thickness = jnp.zeros(len(poses)) if thickness is None else thickness
+    return jax.vmap(lambda *place: explain(world, scan, *place))(poses, thickness)
 
 
 def _distinct(poses, score, count, distance, angle):
     """The best poses, best first; those close to a better one sink with score −inf."""
     order = jnp.argsort(-score)
     poses, score = poses[order], score[order]
-    apart = poses[:, None] - poses
+    apart = poses[:, None] - poses[None]
     close = (jnp.linalg.norm(apart[..., :2], axis=-1) < distance) & (
         jnp.abs(geometry.wrap(apart[..., 2])) < angle
     )

@@ -91,18 +91,18 @@ def _first_hit(world, position, headings, range_max):
 
 
 def _hit_segments(world, position, headings, range_max):
-    """Nearest intersection with any wall: o + r d = a + s (b − a), 0 ≤ s ≤ 1."""
+    """Nearest intersection with any wall, its ends a and b seen from the sensor."""
     along = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=-1)
     dx, dy = along[:, :1], along[:, 1:]  # rays down, walls across
-    wx, wy = (world.end - world.start).T[:, None, :]
     ax, ay = (world.start - position[None, :]).T[:, None, :]
+    bx, by = (world.end - position[None, :]).T[:, None, :]
+    wx, wy = bx - ax, by - ay
     cross = dx * wy - dy * wx
-    safe = jnp.where(cross == 0, 1.0, cross)
-    r = (ax * wy - ay * wx) / safe
-    s = (ax * dy - ay * dx) / safe
-    # A hair of tolerance closes the corner between two walls against rounding.
-    slack = 8 * jnp.finfo(r.dtype).eps
-    met = (cross != 0) & (s >= -slack) & (s <= 1 + slack) & (r >= 0)
+    r = (ax * wy - ay * wx) / jnp.where(cross == 0, 1.0, cross)
+    # The ray's line parts the wall's ends. Two walls that meet in a corner ask this of
+    # the same corner by the same sum, so no ray slips through between them.
+    parted = (ax * dy - ay * dx >= 0) != (bx * dy - by * dx >= 0)
+    met = parted & (cross != 0) & (r >= 0)
     r = jnp.where(met, r, jnp.inf)
     nearest = jnp.argmin(r, axis=1)
     r = jnp.take_along_axis(r, nearest[:, None], axis=1)[:, 0]

@@ -154,3 +154,11 @@ class OccupancyGrid(eqx.Module):
         lower = (1 - u) * self.distance[j, i] + u * self.distance[j, i + 1]
         upper = (1 - u) * self.distance[j + 1, i] + u * self.distance[j + 1, i + 1]
         return (1 - v) * lower + v * upper
+
+    def unknown_at(self, points: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
+        """Whether map-frame points [m] lie in unknown cells or off the map."""
+        height, width = self.cells.shape
+        column, row = jnp.moveaxis(jnp.floor(self.to_cells(points)).astype(int), -1, 0)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        cell = self.cells[row.clip(0, height - 1), column.clip(0, width - 1)]
+        return ~inside | (cell < 0)

@@ -79,3 +79,7 @@ class PolygonMap(eqx.Module):
         rise = jnp.where(straddles, y1 - y0, 1.0)
         crossing = x0 + (y - y0) * (x1 - x0) / rise
         return jnp.sum(straddles & (x < crossing), axis=-1) % 2 == 1
+
+    def unknown_at(self, points: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
+        """Nowhere: a polygon map knows all of its world."""
+        return jnp.zeros(points.shape[:-1], bool)

@@ -1,9 +1,9 @@
 """The thesis author's C++ on 20 noise-free cases: the same numbers, to rounding.
 
-Float64 is held to 1e-9 (measured: 1e-12 on ranges, 1e-14 elsewhere). Float32 on the same
-cases is held to what its 24 bits give on 360 rays of up to 30 m: 1e-6 relative for sums
-over rays, 5e-6 m for a step of the position law. Its iterated positions are not
-compared: a gate, or a corner, decides some of them by rounding.
+Float64 is held to 1e-9 (measured: 1e-12 on ranges, 1e-14 elsewhere). Float32 on the
+same cases is held to what its 24 bits give on 360 rays of up to 30 m: 1e-6 relative for
+sums over rays, 5e-6 m for a step of the position law and for CAER per ray. Its iterated
+positions are held to 2 mm: rounding decides about a ray at the edge of the gate.
 """
 
 import json
@@ -25,7 +25,6 @@ from fsmsm_jax.world import PolygonMap
 
 RAYS = 360
 GATE = 0.25  # the program's: N / 4 times the last step
-ITERATIONS = (1, 2, 4, 8)
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -39,13 +38,14 @@ def golden(request):
     double = request.param == "float64"
     with jax.enable_x64(double):
         stack = lambda key: jnp.asarray([case[key] for case in cases], float)
-        outlines = np.stack([stack("map_x"), stack("map_y")], axis=-1)
+        worlds = [
+            PolygonMap.from_outlines(np.stack([case["map_x"], case["map_y"]], axis=-1))
+            for case in cases
+        ]
         yield SimpleNamespace(
             double=double,
             rtol=1e-9 if double else 1e-6,
-            world=PolygonMap(
-                jnp.asarray(outlines), jnp.asarray(np.roll(outlines, -1, axis=1))
-            ),
+            world=jax.tree.map(lambda *walls: jnp.stack(walls), *worlds),
             bearings=jnp.linspace(-jnp.pi, jnp.pi, RAYS, endpoint=False),
             true=stack("true_pose"),
             initial=stack("initial_pose"),
@@ -80,7 +80,7 @@ def test_virtual_scans(golden):
             # Rays within 1e-4 rad of the vertical may differ; in these cases none does.
             assert error.max() < 1e-9
         else:
-            assert np.quantile(error, 0.999) < 2e-5
+            assert np.quantile(error, 0.999) < 1e-4
 
 
 def test_correlation_and_trace(golden):
@@ -122,9 +122,7 @@ def test_position_step_with_and_without_the_gate(golden, heading):
         moved = (found.pose - pose)[:, :2]
         np.testing.assert_allclose(moved, golden.middle(key, name), atol=atol)
         caer_per_ray = golden.middle(key, "caer")
-        np.testing.assert_allclose(
-            found.caers[:, 0] / RAYS, caer_per_ray, rtol=golden.rtol
-        )
+        np.testing.assert_allclose(found.caers[:, 0] / RAYS, caer_per_ray, atol=atol)
     if heading == "initial":
         law = jax.jit(jax.vmap(position_correction))
         found = law(golden.real, golden.virtual, pose[:, 2])
@@ -135,22 +133,26 @@ def test_position_step_with_and_without_the_gate(golden, heading):
 @pytest.mark.parametrize("heading", ["initial", "true"])
 def test_iterated_position(golden, heading):
     """Where the C++ did not give up (−2: it left its box or the map)."""
-    if not golden.double:
-        pytest.skip("rounding decides which rays pass the gate")
+    # In float32, rounding lets a ray or two through the gate: 0.25 m / 360 each.
+    atol = 1e-9 if golden.double else 2e-3
     pose = start_poses(golden, heading)
-    for iterations in ITERATIONS:
+    for iterations in (2, 8):  # 1 is the step above
         walk = jax.vmap(lambda w, r, p, k=iterations: translate(w, r, p, k, gate=GATE))
         found = jax.jit(walk)(golden.world, golden.real, pose)
-        for name, poses in (("last", found.pose), ("pickmin", found.least)):
+        for name, poses, caers in (
+            ("last", found.pose, found.caers[:, -1]),
+            ("pickmin", found.least, found.caers.min(axis=1)),
+        ):
             of = (f"tc_x1_{heading}_theta", f"tff_{iterations}_{name}")
             caer_per_ray = golden.middle(*of, "ret_caer")
             went = caer_per_ray != -2
             assert went.sum() >= (20 if heading == "true" else 2)
             expected = golden.middle(*of, "pose")
-            np.testing.assert_allclose(poses[went], expected[went], atol=1e-9)
-            np.testing.assert_allclose(
-                found.caers[went, -1] / RAYS, caer_per_ray[went], rtol=1e-9
-            )
+            np.testing.assert_allclose(poses[went], expected[went], atol=atol)
+            if golden.double:
+                np.testing.assert_allclose(
+                    caers[went] / RAYS, caer_per_ray[went], rtol=1e-9
+                )
 
 
 def test_final_caer(golden):
@@ -158,7 +160,8 @@ def test_final_caer(golden):
 
     def at(world, ranges, pose):
         everything = jnp.ones(RAYS, bool)
-        scan = Scan(ranges, golden.bearings, everything, everything, jnp.asarray(30.0))
+        limit = jnp.asarray(30.0)
+        scan = Scan(ranges, golden.bearings, everything, everything, limit)
         return caer_at(world, scan, pose) / RAYS
 
     measure = jax.jit(jax.vmap(at))
