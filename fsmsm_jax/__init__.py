@@ -1,2 +1,49 @@
-"""fsmsm_jax."""
+"""Where is my lidar? 2D lidar localisation by Fourier methods, in JAX.
+
+A tour of the house, in the order in which data passes through it:
+
+- `geometry`: planar poses [x, y, θ] and how they chain.
+- `world`: what surrounds the robot. `load_map` reads a ROS map; `OccupancyGrid` and
+  `PolygonMap` hold one; `buildings` draws floor plans out of nothing.
+- `sensing`: what a lidar sees. `Scan` tidies a real one; `raycast` makes a virtual
+  one, exactly, with its exact derivative; `Lidar` adds the noise; `panorama` brings
+  any scan to equiangular rays.
+- `alignment`: one scan against another. Orientation by circular correlation, position
+  by the first harmonic, `caer` for how alike two scans are, and descent on exact
+  derivatives.
+- `localisation`: where am I. `build_atlas` scans a map once; `localise` finds one
+  scan in it, `localise_batch` many.
+- `evaluation`, `io`, `plotting` and the `fsmsm` command line stand at the edge.
+
+Everything is a pure function of arrays and pytrees: write for one, `jax.vmap` for
+many, `jax.jit` at the entry, `jax.grad` anywhere.
+"""
+
 from fsmsm_jax import geometry as geometry
+from fsmsm_jax.world import (
+    OccupancyGrid as OccupancyGrid,
+    PolygonMap as PolygonMap,
+    buildings as buildings,
+    load_map as load_map,
+    save_map as save_map,
+)
+from fsmsm_jax.sensing import (
+    Lidar as Lidar,
+    Scan as Scan,
+    panorama as panorama,
+    raycast as raycast,
+)
+from fsmsm_jax.alignment import caer_at
+from fsmsm_jax.localisation import (
+    AtlasConfig as AtlasConfig,
+    Localisation as Localisation,
+    ScanAtlas as ScanAtlas,
+    SearchConfig as SearchConfig,
+    build_atlas as build_atlas,
+    localise as localise,
+    localise_batch as localise_batch,
+    memory_estimate as memory_estimate,
+)
+
+caer = caer_at
+__version__ = "0.1.0"

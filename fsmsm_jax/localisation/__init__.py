@@ -4,6 +4,7 @@ from fsmsm_jax.localisation.atlas import (
     AtlasConfig as AtlasConfig,
     ScanAtlas as ScanAtlas,
     build_atlas as build_atlas,
+    memory_estimate as memory_estimate,
 )
 from fsmsm_jax.localisation.search import (
     Localisation as Localisation,

@@ -25,20 +25,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
-from scipy import fft, ndimage
+from jaxtyping import Array, Complex, Float, Int
+from scipy import fft
 from tqdm import tqdm
 
-from fsmsm_jax import geometry
+from fsmsm_jax.localisation.lattice import Lattice, lattice_over
 from fsmsm_jax.sensing.raycast import raycast
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
 
-__all__ = ["AtlasConfig", "Lattice", "ScanAtlas", "build_atlas", "range_phases"]
+__all__ = [
+    "AtlasConfig",
+    "ScanAtlas",
+    "build_atlas",
+    "memory_estimate",
+    "range_phases",
+]
 
 _FREQUENCY = 4.0  # ω: ranges that differ by a factor of two differ by 2.8 rad
 _OFFSET = 0.3  # r₀ [m]: below this, differences of range are clutter
 _CHUNK = 1024  # positions cast together
+_UNREADABLE = (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile)
 
 
 class AtlasConfig(eqx.Module):
@@ -62,29 +69,11 @@ class AtlasConfig(eqx.Module):
         for name in ("spacing", "range_max", "reach", "softness"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be a positive number of metres: {value}")
+                raise ValueError(f"{name} must be a positive length [m], got {value}")
         if self.rays < 8 or self.margin < 0:
             raise ValueError(
                 f"expected rays ≥ 8 and margin ≥ 0, got {self.rays} and {self.margin}"
             )
-
-
-class Lattice(eqx.Module):
-    """A square lattice, turned with the map: node (row, column) is a place to stand."""
-
-    frame: Float[Array, "3"]
-    """Pose of the lattice's lower left corner in the map [m, m, rad]."""
-    allowed: Bool[Array, "rows columns"]
-    """Nodes where a sensor may stand."""
-    spacing: float = eqx.field(static=True)
-    """Distance between nodes [m]; node (0, 0) lies half of it inside the corner."""
-
-    def to_map(
-        self, row: Int[Array, "*batch"], column: Int[Array, "*batch"]
-    ) -> Float[Array, "*batch 2"]:
-        """Map-frame position [m] of nodes."""
-        offset = (jnp.stack([column, row], axis=-1) + 0.5) * self.spacing
-        return geometry.transform_points(self.frame, offset)
 
 
 class ScanAtlas(eqx.Module):
@@ -95,9 +84,9 @@ class ScanAtlas(eqx.Module):
     lattice: Lattice
     """Where the map was scanned from."""
     row_of: Int[Array, "rows columns"]
-    """Index into `panoramas` of each lattice node (0 where none may stand)."""
+    """Index into `panoramas` of each node; of a neighbour where none may stand."""
     panoramas: Complex[Array, "positions rays"]
-    """DFT of e^{iω log(r + r₀)} of each panorama, ray n at map bearing −π + 2πn/rays."""
+    """DFT of each panorama's e^{iω log(r + r₀)}, ray n at bearing −π + 2πn/rays."""
     end_points: Complex[Array, "height half_width"]
     """Half-spectrum of the zero-padded likelihood field."""
     config: AtlasConfig = eqx.field(static=True)
@@ -117,7 +106,10 @@ class ScanAtlas(eqx.Module):
                 allowed=self.lattice.allowed,
                 panoramas=self.panoramas,
                 end_points=self.end_points,
-                **{f"config_{k}": np.asarray(v) for k, v in vars(self.config).items()},
+                **{  # pyright: ignore[reportArgumentType]: keyword names, not options
+                    f"config_{name}": np.asarray(value)
+                    for name, value in vars(self.config).items()
+                },
             )
 
     @classmethod
@@ -135,7 +127,7 @@ class ScanAtlas(eqx.Module):
                 arrays = {
                     k: saved[k] for k in ("frame", "allowed", "panoramas", "end_points")
                 }
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except _UNREADABLE as error:
             raise ValueError(
                 f"cannot read a scan atlas from {path} ({error}); "
                 "build it anew with build_atlas(world) and save it"
@@ -162,9 +154,7 @@ def memory_estimate(
     world: OccupancyGrid | PolygonMap, config: AtlasConfig = AtlasConfig()
 ) -> int:
     """Bytes that the atlas of this world will hold, without building it."""
-    allowed = _lattice(world, config).allowed
-    height, width = _padded_shape(allowed.shape, config)
-    return 8 * (int(allowed.sum()) * config.rays + height * (width // 2 + 1))
+    return _bytes(lattice_over(world, config.spacing, config.margin), config)
 
 
 def build_atlas(
@@ -190,32 +180,27 @@ def build_atlas(
         >>> atlas.panoramas.shape
         (48, 180)
     """
-    lattice = _lattice(world, config)
-    row, column = np.nonzero(np.asarray(lattice.allowed))
-    position = lattice.to_map(jnp.asarray(row), jnp.asarray(column))
-    count = len(row)
+    lattice = lattice_over(world, config.spacing, config.margin)
+    position = lattice.positions[lattice.allowed]
+    count = len(position)
     padded = jnp.pad(position, ((0, -count % _CHUNK), (0, 0)), mode="edge")
-    chunks = []
-    for chunk in tqdm(
-        jnp.split(padded, len(padded) // _CHUNK),
-        desc=f"atlas of {count} positions, "
-        f"{memory_estimate(world, config) / 1e6:.0f} MB",
-        unit="chunk",
-        disable=not progress,
-    ):
-        chunks.append(_scan_from(world, chunk, config))
+    cost = f"atlas of {count} positions, {_bytes(lattice, config) / 1e6:.0f} MB"
+    batches = tqdm(
+        jnp.split(padded, len(padded) // _CHUNK), desc=cost, disable=not progress
+    )
+    panoramas = [_panoramas_from(world, batch, config) for batch in batches]
     return ScanAtlas(
         world=world,
         lattice=lattice,
         row_of=_row_of(np.asarray(lattice.allowed)),
-        panoramas=jnp.concatenate(chunks)[:count],
+        panoramas=jnp.concatenate(panoramas)[:count],
         end_points=_end_point_spectrum(world, lattice, config),
         config=config,
     )
 
 
 @jax.jit
-def _scan_from(world, positions, config):
+def _panoramas_from(world, positions, config):
     """Spectra of the panoramas seen from a chunk of positions."""
     bearings = -jnp.pi + 2 * jnp.pi * jnp.arange(config.rays) / config.rays
     poses = jnp.pad(positions, ((0, 0), (0, 1)))
@@ -228,48 +213,19 @@ def range_phases(ranges: Float[Array, "*batch rays"]) -> Complex[Array, "*batch 
     return jnp.exp(1j * _FREQUENCY * jnp.log(ranges + _OFFSET))
 
 
-def _lattice(world, config) -> Lattice:
-    """The nodes over the known part of the map from which a lidar could see it."""
-    if isinstance(world, OccupancyGrid):
-        free, occupied = np.asarray(world.free), np.asarray(world.occupied)
-        resolution = float(world.resolution)
-        rows, columns = (np.nonzero((free | occupied).any(axis=a))[0] for a in (1, 0))
-        if not free.any():
-            raise ValueError("the map has no free cell to stand on; check its thresholds")
-        corner = np.array([columns[0], rows[0]]) * resolution
-        size = (np.array([columns[-1], rows[-1]]) + 1) * resolution - corner
-        frame = geometry.compose(world.origin, jnp.asarray([*corner, 0.0], float))
-        to_free = ndimage.distance_transform_edt(~free) * resolution
-        stand = to_free <= config.spacing / 2  # any free spot near the node will do
-        stand |= np.asarray(world.unknown) & (to_free <= config.margin)
-    else:
-        corner = np.minimum(world.start.min(axis=0), world.end.min(axis=0))
-        size = np.asarray(jnp.maximum(world.start.max(axis=0), world.end.max(axis=0)))
-        size = size - corner
-        frame = jnp.asarray([*corner, 0.0], float)
-    shape = np.maximum(np.ceil(size / config.spacing - 1e-6).astype(int), 1)[::-1]
-    nodes = Lattice(frame, jnp.ones(tuple(shape), bool), config.spacing)
-    place = nodes.to_map(*(jnp.asarray(i) for i in np.indices(tuple(shape))))
-    if isinstance(world, OccupancyGrid):
-        column, row = np.moveaxis(np.floor(np.asarray(world.to_cells(place))), -1, 0)
-        row = np.clip(row.astype(int), 0, stand.shape[0] - 1)
-        allowed = stand[row, np.clip(column.astype(int), 0, stand.shape[1] - 1)]
-    else:
-        allowed = np.asarray(world.contains(place))
-    if not allowed.any():
-        raise ValueError(
-            f"no lattice position of spacing {config.spacing} m lies in free space; "
-            "choose a smaller spacing"
-        )
-    return Lattice(frame, jnp.asarray(allowed), config.spacing)
-
-
+@jax.jit
 def _end_point_spectrum(world, lattice, config):
-    rows, columns = lattice.allowed.shape
-    nodes = np.indices((rows, columns))
-    distance = world.distance_at(lattice.to_map(*(jnp.asarray(i) for i in nodes)))
+    """Half-spectrum of exp(−d²/2σ²) at the lattice's nodes."""
+    distance = world.distance_at(lattice.positions)
     likelihood = jnp.exp(-0.5 * (distance / config.softness) ** 2)
-    return jnp.fft.rfft2(likelihood, s=_padded_shape((rows, columns), config))
+    return jnp.fft.rfft2(likelihood, s=_padded_shape(likelihood.shape, config))
+
+
+def _bytes(lattice, config) -> int:
+    """Size of the two spectra: eight bytes a complex number."""
+    height, width = _padded_shape(lattice.allowed.shape, config)
+    positions = int(lattice.allowed.sum())
+    return 8 * (positions * config.rays + height * (width // 2 + 1))
 
 
 def _padded_shape(shape, config) -> tuple[int, int]:
@@ -280,7 +236,7 @@ def _padded_shape(shape, config) -> tuple[int, int]:
     """
     reach = int(np.ceil(0.5 * config.reach / config.spacing)) + 2
     rows, columns = (fft.next_fast_len(n + reach, real=True) for n in shape)
-    return int(rows), int(columns)
+    return rows, columns  # pyright: ignore[reportReturnType]: scipy's stub says None
 
 
 def _row_of(allowed):

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from fsmsm_jax import geometry
 from fsmsm_jax.localisation.atlas import ScanAtlas
 from fsmsm_jax.sensing.lidar import Scan
 
@@ -112,5 +111,7 @@ def _scan_image(atlas, scan, theta):
     height, width = atlas.padded_shape
     x, y = (jnp.concatenate(a).astype(jnp.int32) for a in (x, y))
     index = (y % height) * width + x % width
-    image = jnp.zeros(height * width, scan.ranges.dtype).at[index].add(jnp.concatenate(w))
+    image = (
+        jnp.zeros(height * width, scan.ranges.dtype).at[index].add(jnp.concatenate(w))
+    )
     return image.reshape(height, width)

@@ -141,7 +141,7 @@ def _check(atlas, scan, *, batched):
     if axes != wanted:
         raise ValueError(
             f"expected {'(scans, rays)' if batched else '(rays,)'} ranges, got shape "
-            f"{np.shape(scan.ranges)}; use localise for one scan, localise_batch for many"
+            f"{np.shape(scan.ranges)}; localise takes one scan, localise_batch many"
         )
     near = np.asarray(scan.echo) & (np.asarray(scan.ranges) < atlas.config.reach)
     echoes = near.sum(axis=-1)

@@ -233,7 +233,7 @@ def test_covariance_turns_with_the_world():
     np.testing.assert_allclose(R @ here @ R.T, there, atol=0.01 * scale)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.7])
+@pytest.mark.parametrize("yaw", [0.0, 0.1, 0.7, 2.4])
 def test_a_corridor_hides_where_along_it_one_stands(yaw):
     """Two walls 2 m apart, their ends out of sight."""
     corners = np.array([[-100, -1], [100, -1], [100, 1], [-100, 1]])
@@ -347,54 +347,45 @@ def batch():
     return world, scans, perturbed(true, 0.1, 0.05)
 
 
-def test_jit_and_vmap_change_nothing(batch):
-    """Sums of 180 float32 terms in another order: a few times 180 × 6e-8."""
-    world, scans, starts = batch
-    tolerance = {"rtol": 1e-4, "atol": 5e-5}
-    first = jax.tree.map(lambda a: a[0], (scans, starts))
-    pose, thickness = polish_ranges(world, *first, POLISH)
-    jitted = polish(world, *first, POLISH)
-    np.testing.assert_allclose(jitted[0], pose, **tolerance)
-    np.testing.assert_allclose(jitted[1], thickness, **tolerance)
-    eager = descend_end_points(world, *first, DESCENT)
-    np.testing.assert_allclose(descend(world, *first, DESCENT), eager, **tolerance)
-    eager = covariance(world, first[0], pose, thickness)
-    near = {"rtol": 0.01, "atol": 1e-9}
-    np.testing.assert_allclose(spread(world, first[0], pose, thickness), eager, **near)
+def refine(world, scan, start, scales):
+    """All of the module at once, to compile once."""
+    down = descend_end_points(world, scan, start, scales)
+    pose, thickness = polish_ranges(world, scan, start, scales)
+    return down, pose, thickness, covariance(world, scan, pose, thickness)
 
-    many = jax.vmap(polish, (None, 0, 0, None))(world, scans, starts, POLISH)
-    down = jax.vmap(descend, (None, 0, 0, None))(world, scans, starts, DESCENT)
-    wide = jax.vmap(spread, (None, 0, 0, 0))(world, scans, *many)
+
+def assert_same(one, other):
+    """Sums of 180 float32 terms in another order: a few times 180 × 6e-8."""
+    for a, b in zip(one[:3], other[:3], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5)
+    # σ is a median of millimetres, whose own rounding counts for some per mille.
+    np.testing.assert_allclose(one[3], other[3], rtol=0.02, atol=1e-9)
+
+
+def test_jit_and_vmap_change_nothing(batch):
+    world, scans, starts = batch
+    jitted = jax.jit(refine)
+    many = jax.jit(jax.vmap(refine, (None, 0, 0, None)))(world, scans, starts, POLISH)
     for i in range(len(starts)):
-        one = jax.tree.map(lambda a, i=i: a[i], (scans, starts))
-        np.testing.assert_allclose(many[0][i], polish(world, *one, POLISH)[0],
-                                   **tolerance)  # fmt: skip
-        np.testing.assert_allclose(down[i], descend(world, *one, DESCENT), **tolerance)
-        single = spread(world, one[0], many[0][i], many[1][i])
-        np.testing.assert_allclose(wide[i], single, **near)
+        scan, start = jax.tree.map(lambda a, i=i: a[i], (scans, starts))
+        one = jitted(world, scan, start, POLISH)
+        assert_same([a[i] for a in many], one)
+        if i == 0:
+            assert_same(refine(world, scan, start, POLISH), one)
 
 
 def test_double_precision_is_kept_and_agrees(batch):
     world, scans, starts = batch
     scan, start = jax.tree.map(lambda a: a[0], (scans, starts))
     single = polish(world, scan, start, POLISH)[0]
+    single_scan = jax.tree.map(np.asarray, (world, scan, start, POLISH))
     with jax.enable_x64(True):
-        double = lambda tree: jax.tree.map(
-            lambda a: (
-                jnp.asarray(np.asarray(a), jnp.float64) if a.dtype == np.float32 else a
-            ),
-            tree,
-        )
-        args = double((world, scan, start))
-        scales = jnp.asarray(np.asarray(POLISH), jnp.float64)
-        pose, thickness = jax.jit(polish_ranges)(*args, scales)
-        down = jax.jit(descend_end_points)(*args, scales)
-        C = jax.jit(covariance)(*args[:2], pose, thickness)
-        for value in (pose, thickness, down, C):
+        double = lambda a: jnp.asarray(a, np.float64 if a.dtype == np.float32 else None)
+        found = jax.jit(refine)(*jax.tree.map(double, single_scan))
+        for value in found:
             assert value.dtype == jnp.float64
             assert np.isfinite(value).all()
-        C = np.asarray(C)
-        pose = np.asarray(pose)
+        _, pose, _, C = (np.asarray(a) for a in found)
     np.testing.assert_allclose(pose, single, atol=5e-5)
     np.testing.assert_allclose(C, C.T, rtol=1e-9)
     assert np.linalg.eigvalsh(C).min() > 0

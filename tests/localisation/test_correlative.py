@@ -101,7 +101,7 @@ def test_the_right_place_is_among_the_first(atlas):
         offset = [*rng.uniform([-1.2, -0.5], [3.0, 1.0]), rng.uniform(-np.pi, np.pi)]
         pose = jnp.asarray(np.array([*CENTRE, 0.0]) + offset, float)
         poses, _, _ = rank(atlas, scan_from(world, pose, i), HEADINGS, 32)
-        off = np.asarray(poses[:10] - pose, float)
+        off = np.asarray(poses[:10], float) - np.asarray(pose)
         turned = np.abs((off[:, 2] + np.pi) % (2 * np.pi) - np.pi)
         near = np.hypot(off[:, 0], off[:, 1]) < 1.5 * CONFIG.spacing
         assert (near & (turned < 1.5 * 2 * np.pi / HEADINGS)).any()
@@ -155,7 +155,7 @@ def test_a_turned_map_is_searched_as_it_lies():
     moved, moved_index, moved_scores = rank(there, scan, HEADINGS, 10)
     np.testing.assert_allclose(moved_scores, scores, atol=1e-4)
     best = geometry.compose(move, poses[0])
-    off = np.asarray(moved - best, float)
+    off = np.asarray(moved, float) - np.asarray(best)
     off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
     # Equal scores may change places, and sectors of headings begin elsewhere.
     same = np.flatnonzero(np.abs(off).max(axis=1) < 1e-3)
