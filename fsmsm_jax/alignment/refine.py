@@ -101,19 +101,20 @@ def covariance(
     scan: Scan,
     pose: Float[Array, "3"],
     thickness: float | Float[Array, ""] = 0.0,
-    floor: float = 0.005,
+    floor: float | Float[Array, ""] = 0.005,
 ) -> Float[Array, "3 3"]:
     """Covariance of a polished pose [m, m, rad], by the information of its ranges.
 
-    A⁻¹ B A⁻¹, where A = Σ J Jᵀ/σ² is the Fisher information and B the scatter of
-    the score: residuals are summed over `_SECTORS` runs of neighbouring rays before
-    they are squared, so that errors which neighbours share (a wall drawn askew, a
-    moved cabinet) count as one error and not as many that cancel. Were all errors
-    independent, B = A and the covariance would be the Cramér–Rao bound; it is never
-    reported smaller than that. σ is read off the residuals (1.48 times their median
-    size, at least `floor` [m]) and rays farther off than 3σ are left out. The walls'
-    thickness counts as unknown. A direction that no ray measures (along a corridor)
-    keeps a variance of (10 m)² or (π rad)²: degeneracy is reported, never hidden.
+    A⁻¹ B A⁻¹, where A = Σ J Jᵀ/σ² is the Fisher information, σ across the wall,
+    and B the scatter of the score: residuals are summed over `_SECTORS` runs of
+    neighbouring rays before they are squared, so that errors which neighbours share
+    (a wall drawn askew, a moved cabinet) count as one error and not as many that
+    cancel. Were all errors independent, B = A and the covariance would be the
+    Cramér–Rao bound; it is never reported smaller than that. σ is read off the
+    residuals (1.48 times their median size, at least `floor` [m]) and rays farther
+    off than 3σ are left out. The walls' thickness counts as unknown. A direction
+    that no ray measures (along a corridor) keeps a variance of (10 m)² or (π rad)²:
+    degeneracy is reported, never hidden.
 
     Reference:
         A. Censi, "On achievable accuracy for range-finder localization", ICRA 2007;
@@ -125,14 +126,17 @@ def covariance(
     sigma = jnp.where(jnp.any(known), jnp.maximum(sigma, floor), floor)
     used = (known & (jnp.abs(e) < 3 * sigma))[:, None]
     J = jnp.where(used, J / sigma, 0.0)
-    prior = jnp.diag(1 / jnp.asarray(_PRIOR_VARIANCE, pose.dtype))
-    bound = jnp.linalg.inv(J.T @ J + prior)
+    prior = jnp.diag(1 / jnp.sqrt(jnp.asarray(_PRIOR_VARIANCE, pose.dtype)))
+    # A⁻¹ = H Hᵀ by QR: squaring J first would lose a corridor's direction in float32.
+    root = jnp.linalg.qr(jnp.concatenate([J, prior]), mode="r")
+    identity = jnp.eye(4, dtype=pose.dtype)
+    H = jax.scipy.linalg.solve_triangular(root, identity)
     score = J * jnp.where(used, e[:, None] / sigma, 0.0)
     sector = (jnp.arange(len(e)) * _SECTORS) // len(e)
-    score = jax.ops.segment_sum(score, sector, _SECTORS)
+    score = jax.ops.segment_sum(score, sector, _SECTORS) @ H
     scatter = score.T @ score * _SECTORS / (_SECTORS - 4)
-    shared = bound @ scatter @ bound
-    return (bound + _positive_part(shared - bound))[:3, :3]
+    whole = H @ (identity + _positive_part(scatter - identity)) @ H.T
+    return (0.5 * (whole + whole.T))[:3, :3]
 
 
 def _positive_part(matrix):

@@ -45,7 +45,7 @@ __all__ = [
 _FREQUENCY = 4.0  # ω: ranges that differ by a factor of two differ by 2.8 rad
 _OFFSET = 0.3  # r₀ [m]: below this, differences of range are clutter
 _CHUNK = 1024  # positions cast together
-_UNREADABLE = (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile)
+_UNREADABLE = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
 
 
 class AtlasConfig(eqx.Module):
@@ -60,7 +60,7 @@ class AtlasConfig(eqx.Module):
     reach: float = eqx.field(static=True, default=15.0)
     """End points farther than this from the sensor do not vote in the search [m]."""
     softness: float = eqx.field(static=True, default=0.35)
-    """σ of the likelihood field [m]: about one spacing, so that no wall slips through."""
+    """σ of the likelihood field [m]: about a spacing, so that no wall slips through."""
     margin: float = eqx.field(static=True, default=1.0)
     """How far into unknown space a sensor may stand [m]."""
 
@@ -70,7 +70,7 @@ class AtlasConfig(eqx.Module):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be a positive length [m], got {value}")
-        if self.rays < 8 or self.margin < 0:
+        if self.rays < 8 or not self.margin >= 0:
             raise ValueError(
                 f"expected rays ≥ 8 and margin ≥ 0, got {self.rays} and {self.margin}"
             )
@@ -121,7 +121,7 @@ class ScanAtlas(eqx.Module):
         """
         names = list(AtlasConfig.__dataclass_fields__)
         try:
-            with np.load(path) as saved:
+            with Path(path).open("rb") as file, np.load(file) as saved:
                 fingerprint = str(saved["fingerprint"])
                 config = AtlasConfig(**{k: saved[f"config_{k}"].item() for k in names})
                 arrays = {
@@ -132,9 +132,15 @@ class ScanAtlas(eqx.Module):
                 f"cannot read a scan atlas from {path} ({error}); "
                 "build it anew with build_atlas(world) and save it"
             ) from error
+        expected = (int(arrays["allowed"].sum()), config.rays)
+        if arrays["panoramas"].shape != expected:
+            raise ValueError(
+                f"the atlas {path} is damaged: expected panoramas of shape {expected}, "
+                f"got {arrays['panoramas'].shape}; build it anew with build_atlas"
+            )
         if fingerprint != _fingerprint(world):
             raise ValueError(
-                f"the atlas {path} was built for another map (or other settings of it); "
+                f"the atlas {path} was built for another map, or other settings of it; "
                 "load that map, or build a new atlas for this one with build_atlas"
             )
         lattice = Lattice(

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from fsmsm_jax import geometry
 from fsmsm_jax.localisation.atlas import ScanAtlas
 from fsmsm_jax.sensing.lidar import Scan
 
@@ -77,14 +78,17 @@ def rank_poses(
     row = jnp.minimum(row * _BLOCK + place // _BLOCK % _BLOCK, rows - 1)
     column = jnp.minimum(column * _BLOCK + place % _BLOCK, columns - 1)
     position = lattice.to_map(row, column)
-    poses = jnp.concatenate([position, theta[heading, None]], axis=1)
+    turned = geometry.wrap(theta[heading, None] + lattice.frame[2])
+    poses = jnp.concatenate([position, turned], axis=1)
     return poses, atlas.row_of[row, column], (value >> 5) / (1 << 20)
 
 
 def _scan_image(atlas, scan, theta):
-    """End points (and, negative, points inside the rays) splatted on the lattice."""
+    """End points (and, negative, points inside the rays) splatted on the lattice.
+
+    The heading theta is in the lattice's frame: a turned map is searched as it lies.
+    """
     spacing, reach = atlas.config.spacing, atlas.config.reach
-    theta = theta - atlas.lattice.frame[2]
     near = scan.echo & (scan.ranges < reach)
     # Far walls are hit by few rays and say more about the heading: weight √r.
     weight = jnp.sqrt(jnp.clip(scan.ranges, 0.3, 10.0))

@@ -93,6 +93,7 @@ def _over_grid(world, spacing, margin):
         cell = np.floor(np.asarray(world.to_cells(points))).astype(int)
         column, row = np.moveaxis(cell, -1, 0)
         height, width = stand.shape
-        return stand[row.clip(0, height - 1), column.clip(0, width - 1)]
+        on_map = (0 <= row) & (row < height) & (0 <= column) & (column < width)
+        return on_map & stand[row.clip(0, height - 1), column.clip(0, width - 1)]
 
     return frame, size, may_stand

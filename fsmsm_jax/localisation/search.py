@@ -33,6 +33,7 @@ from fsmsm_jax.sensing.panorama import panorama
 
 __all__ = ["Candidates", "Localisation", "SearchConfig", "localise", "localise_batch"]
 
+_TOGETHER = 4  # scans of a batch in step: beyond that their images leave the cache
 _FEWEST_ECHOES = 20  # fewer end points fit somewhere in any building
 
 
@@ -53,6 +54,19 @@ class SearchConfig(eqx.Module):
     """Rays of the exhaustive search and of the polish."""
     descent_rays: int = eqx.field(static=True, default=90)
     """Rays of the descent."""
+
+    def __check_init__(self):
+        """Refuse what the search cannot work with."""
+        if self.headings < 6 or self.headings % 6:
+            raise ValueError(f"headings must be a multiple of 6, got {self.headings}")
+        if not 2 <= self.reported <= self.polished <= self.descended <= self.ranked:
+            raise ValueError(
+                "candidates dwindle: expected 2 ≤ reported ≤ polished ≤ descended "
+                f"≤ ranked, got {self.reported}, {self.polished}, {self.descended}, "
+                f"{self.ranked}"
+            )
+        if min(self.search_rays, self.descent_rays) < 8:
+            raise ValueError("search_rays and descent_rays must be at least 8")
 
 
 class Candidates(NamedTuple):
@@ -177,7 +191,7 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
     score = _judge(world, ranking_scan, poses, thickness).score
     poses, score = _distinct(poses, score, config.reported, 0.3, 0.25)
 
-    scales = jnp.array([0.2, 0.15, 0.1, 0.1])
+    scales = jnp.full(4, 0.3)  # wide: every good ray counts, as the bound asks
     polish = lambda pose: polish_ranges(world, scan, pose, scales)
     poses, thickness = jax.vmap(polish)(poses)
     evidence = _judge(world, scan, poses, thickness)
@@ -186,20 +200,21 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
     poses, score, thickness = poses[order], score[order], thickness[order]
     evidence = jax.tree.map(lambda a: a[order], evidence)
     spread = covariance(world, scan, poses[0], thickness[0])
+    best = jax.tree.map(lambda a: a[0], evidence)
     return Localisation(
         pose=poses[0],
         covariance=spread,
-        caer_per_ray=evidence.caer_per_ray[0],
-        explained=evidence.explained[0],
-        confident=trust(score, evidence.explained[0], spread),
+        caer_per_ray=best.caer_per_ray,
+        explained=best.explained,
+        confident=trust(score, best, spread),
         candidates=Candidates(poses, score, evidence.caer_per_ray),
     )
 
 
 @jax.jit
 def _localise_batch(atlas, scans, config):
-    # One after the other: each scan's own batches already fill the machine.
-    return jax.lax.map(lambda scan: _localise(atlas, scan, config), scans)
+    one = lambda scan: _localise(atlas, scan, config)
+    return jax.lax.map(one, scans, batch_size=_TOGETHER)
 
 
 def _turn(atlas, scan, poses, row):

@@ -63,18 +63,28 @@ class PolygonMap(eqx.Module):
 
     def distance_at(self, points: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
         """Distance [m] from map-frame points to the nearest wall; differentiable."""
-        wall = self.end - self.start
-        length2 = jnp.maximum(jnp.sum(wall**2, axis=-1), jnp.finfo(wall.dtype).tiny)
-        to_point = points[..., None, :] - self.start
-        along = jnp.clip(jnp.sum(to_point * wall, axis=-1) / length2, 0, 1)
-        gap2 = jnp.sum((to_point - along[..., None] * wall) ** 2, axis=-1).min(axis=-1)
+        x, y = points[..., 0, None], points[..., 1, None]  # points down, walls across
+        each = (1,) * (points.ndim - 1) + (-1,)
+        (ax, ay), (bx, by) = (
+            self.start.T.reshape(2, *each),
+            self.end.T.reshape(2, *each),
+        )
+        wx, wy = bx - ax, by - ay
+        length2 = jnp.maximum(wx**2 + wy**2, jnp.finfo(wx.dtype).tiny)
+        along = jnp.clip(((x - ax) * wx + (y - ay) * wy) / length2, 0, 1)
+        gap2 = (x - ax - along * wx) ** 2 + (y - ay - along * wy) ** 2
+        gap2 = gap2.min(axis=-1)
         # The square root has no slope at a wall; a millionth of a metre gives it one.
         return jnp.sqrt(gap2 + 1e-12)
 
     def contains(self, points: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
         """Whether map-frame points [m] lie inside, by the even-odd rule."""
-        x, y = points[..., None, 0], points[..., None, 1]
-        (x0, y0), (x1, y1) = self.start.T, self.end.T
+        x, y = points[..., 0, None], points[..., 1, None]
+        each = (1,) * (points.ndim - 1) + (-1,)
+        (x0, y0), (x1, y1) = (
+            self.start.T.reshape(2, *each),
+            self.end.T.reshape(2, *each),
+        )
         straddles = (y0 <= y) != (y1 <= y)
         rise = jnp.where(straddles, y1 - y0, 1.0)
         crossing = x0 + (y - y0) * (x1 - x0) / rise

@@ -1,0 +1,166 @@
+"""What counts for a pose, what against it, and what is not to be believed.
+
+Nothing here knows the judge's constants: only which of two cases is the better.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fsmsm_jax.localisation.judge import explain, trust
+from fsmsm_jax.sensing import Lidar, Scan, raycast
+from tests.oracles.raycast import cast_walls
+from tests.worlds import CENTRE, l_room, rasterised_room
+
+SENSOR = Lidar.create(180, noise=0.0, range_max=8.0)
+POSE = jnp.asarray([*(CENTRE + [0.4, 0.3]), 0.6], float)
+CERTAIN = jnp.diag(jnp.array([1e-6, 1e-6, 1e-6]))
+
+judge = jax.jit(explain)
+cast = jax.jit(raycast)
+
+
+def scan_of(ranges, valid=True):
+    """The sensor's scan with these ranges; from `range_max` on there is no echo."""
+    valid = jnp.broadcast_to(jnp.asarray(valid), (180,))
+    echo = valid & (ranges < SENSOR.range_max)
+    ranges = jnp.where(echo, ranges, SENSOR.range_max)
+    return Scan(ranges, SENSOR.bearings, valid, echo, SENSOR.range_max)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return cast(l_room(), POSE, SENSOR.bearings, SENSOR.range_max)
+
+
+def test_a_true_scan_is_explained_wholly(exact):
+    found = judge(l_room(), scan_of(exact), POSE)
+    assert float(found.explained) == 1
+    assert float(found.caer_per_ray) < 1e-5
+
+
+def test_no_other_pose_scores_higher(exact):
+    world, scan, rng = l_room(), scan_of(exact), np.random.default_rng(0)
+    best = float(judge(world, scan, POSE).score)
+    last = best
+    for metres in (0.05, 0.1, 0.2, 0.4):  # and the farther, the lower, on average
+        scores = []
+        for way in rng.uniform(-np.pi, np.pi, 8):
+            step = metres * np.array([np.cos(way), np.sin(way), 0.0])
+            scores.append(float(judge(world, scan, POSE + jnp.asarray(step)).score))
+        assert max(scores) < best
+        assert np.mean(scores) < last
+        last = np.mean(scores)
+    turned = [float(judge(world, scan, POSE.at[2].add(a)).score) for a in (-0.1, 0.1)]
+    assert max(turned) < best
+
+
+def test_caer_is_the_mean_over_what_both_see(exact):
+    """By the oracle's casts, at a wrong pose, with echoes missing on either side."""
+    world, pose = l_room(), POSE + jnp.array([0.3, -0.2, 0.4])
+    ranges = jnp.where(jnp.arange(180) % 9 == 0, SENSOR.range_max, exact)
+    scan = scan_of(ranges, jnp.arange(180) % 7 > 0)
+    x, y, theta = np.asarray(pose, float)
+    start, end = np.asarray(world.start, float), np.asarray(world.end, float)
+    headings = theta + np.asarray(SENSOR.bearings, float)
+    limit = float(SENSOR.range_max)
+    virtual = cast_walls(start, end, np.array([x, y]), headings, limit)
+    both = np.asarray(scan.echo) & (virtual < limit)
+    difference = np.abs(np.asarray(scan.ranges, float) - virtual)
+    assert 0 < both.sum() < np.asarray(scan.valid).sum()
+    found = judge(world, scan, pose)
+    np.testing.assert_allclose(found.caer_per_ray, difference[both].mean(), rtol=1e-3)
+
+
+def test_invalid_rays_have_no_say(exact):
+    keep = jnp.arange(180) % 3 > 0
+    garbage = jnp.where(keep, exact, 0.1 + 0.01 * jnp.arange(180))
+    one = judge(l_room(), scan_of(exact, keep), POSE)
+    other = judge(l_room(), scan_of(garbage, keep), POSE)
+    np.testing.assert_array_equal(jnp.stack(one), jnp.stack(other))
+
+
+def test_a_ray_through_a_wall_is_worse_than_one_that_was_stopped(exact):
+    """In range of 20 rays: half a metre short (a person), half a metre long."""
+    some = jnp.arange(180) % 9 == 0
+    clear = float(judge(l_room(), scan_of(exact), POSE).score)
+    scores = [
+        float(judge(l_room(), scan_of(jnp.where(some, exact + off, exact)), POSE).score)
+        for off in (-0.5, 0.5)
+    ]
+    assert scores[1] < scores[0] < clear
+
+
+def test_one_ray_has_a_bounded_say(exact):
+    """A metre off or six, it says no and no more."""
+    scores = [
+        float(judge(l_room(), scan_of(exact.at[90].set(r)), POSE).score)
+        for r in (exact[90] + 1.0, exact[90] + 4.0)
+    ]
+    clear = float(judge(l_room(), scan_of(exact), POSE).score)
+    assert clear > max(scores)
+    assert abs(scores[0] - scores[1]) < 0.5 * (clear - max(scores))
+
+
+def test_the_walls_thickness_is_taken_off():
+    """Ranges that are all 4 cm longer fit walls drawn 4 cm too thick."""
+    grid, _ = rasterised_room(0.0)
+    pose = jnp.asarray(grid.to_map(jnp.array([110.0, 125.0])), float)
+    pose = jnp.append(pose, 0.3)
+    exact = cast(grid, pose, SENSOR.bearings, SENSOR.range_max)
+    scan = scan_of(exact + 0.04)
+    thick, thin = (float(judge(grid, scan, pose, b).score) for b in (0.04, 0.0))
+    assert thick > thin
+
+
+def test_nothing_valid_is_no_nan():
+    for ranges, valid in ((jnp.full(180, 2.0), False), (jnp.full(180, 99.0), True)):
+        found = judge(l_room(), scan_of(ranges, valid), POSE)
+        assert np.isfinite(jnp.stack(found)).all()
+
+
+def sure(scores=(0.0, -5.0), explained=1.0, covariance=CERTAIN):
+    scores = jnp.asarray(scores, float)
+    return bool(trust(scores, jnp.asarray(explained, float), covariance))
+
+
+def test_what_is_explained_fixed_and_alone_is_trusted():
+    assert sure()
+    assert sure(scores=(0.0, -jnp.inf))  # no rival at all
+
+
+def test_what_lacks_one_of_the_three_is_not():
+    assert not sure(scores=(0.0, 0.0))
+    assert not sure(scores=(-5.0, -5.001))
+    assert not sure(explained=0.1)
+    loose = jnp.diag(jnp.array([1.0, 1e-6, 1e-6]))
+    turned = jnp.array([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.0, 1e-6]])
+    assert not sure(covariance=loose)
+    assert not sure(covariance=loose[::-1, ::-1].at[1, 1].set(1.0))
+    assert not sure(covariance=turned)  # a corridor at 45°
+
+
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
+def test_what_is_not_a_number_is_never_trusted(value):
+    assert not sure(covariance=CERTAIN * value)
+    assert not sure(scores=(jnp.nan, -5.0))
+    assert not sure(explained=jnp.nan)
+
+
+def test_a_negative_variance_is_no_certainty():
+    """Rounding can make one, of all places, in a corridor."""
+    assert not sure(covariance=jnp.diag(jnp.array([-4.0, 1e-6, 1e-6])))
+
+
+def test_jit_and_vmap_change_nothing(exact):
+    """Means of 180 float32 terms in another order."""
+    world, scan = l_room(), scan_of(exact)
+    poses = POSE[None] + jnp.linspace(-0.3, 0.3, 5)[:, None]
+    many = jax.vmap(judge, (None, None, 0))(world, scan, poses)
+    for i, pose in enumerate(poses):
+        one = judge(world, scan, pose)
+        np.testing.assert_allclose(jnp.stack(many)[:, i], jnp.stack(one), atol=1e-4)
+    eager = explain(world, scan, POSE)
+    jitted = judge(world, scan, POSE)
+    np.testing.assert_allclose(jnp.stack(eager), jnp.stack(jitted), atol=1e-5)
