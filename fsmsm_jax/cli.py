@@ -68,7 +68,7 @@ def localise(
     topic: str | None = None,
     json: bool = False,
     picture: Path = Path("localise.png"),
-    spacing: float = 0.25,
+    spacing: float = 0.4,
     atlas: Path | None = None,
 ) -> None:
     """Say where on a map one scan of a log was taken.

@@ -43,7 +43,7 @@ _LEAD, _LEAD_PER_DOUBT = (
     0.5,
 )  # margin [nats a ray] of a sure answer: a + b·(−score)
 _MOST = 0.6  # share of the rays that a sure answer explains
-_HARDLY_ANY = 0.03  # share of its rays that may pass through walls
+_HARDLY_ANY = 0.05  # share of its rays that may pass through walls
 _FIXED = 0.1  # [m]: standard deviation of the position of a sure answer
 
 

@@ -185,24 +185,27 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
     score = _judge(world, descent_scan, poses).score
     poses, _ = _distinct(poses, score, config.polished, 0.25, 0.15)
 
-    scales = jnp.array([0.5, 0.3, 0.2, 0.2])
+    scales = jnp.array([0.4, 0.25, 0.2])
     polish = lambda pose: polish_ranges(world, ranking_scan, pose, scales)
     poses, thickness = jax.vmap(polish)(poses)
     score = _judge(world, ranking_scan, poses, thickness).score
     poses, score = _distinct(poses, score, config.reported, 0.3, 0.25)
 
-    scales = jnp.full(4, 0.3)  # wide: every good ray counts, as the bound asks
+    scales = jnp.array([0.2, 0.15, 0.1])  # sharp: what is there decides
     polish = lambda pose: polish_ranges(world, scan, pose, scales)
     poses, thickness = jax.vmap(polish)(poses)
     evidence = _judge(world, scan, poses, thickness)
     score = jnp.where(jnp.isneginf(score), score, evidence.score)
     order = jnp.argsort(-score)
-    poses, score, thickness = poses[order], score[order], thickness[order]
+    poses, score = poses[order], score[order]
     evidence = jax.tree.map(lambda a: a[order], evidence)
-    spread = covariance(world, scan, poses[0], thickness[0])
+    scales = jnp.full(4, 0.3)  # wide: all good rays count, as the bound asks
+    pose, thick = polish_ranges(world, scan, poses[0], scales)
+    poses = poses.at[0].set(pose)
+    spread = covariance(world, scan, pose, thick)
     best = jax.tree.map(lambda a: a[0], evidence)
     return Localisation(
-        pose=poses[0],
+        pose=pose,
         covariance=spread,
         caer_per_ray=best.caer_per_ray,
         explained=best.explained,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fsmsm_jax.localisation.judge import explain, trust
+from fsmsm_jax.localisation.judge import Evidence, explain, trust
 from fsmsm_jax.sensing import Lidar, Scan, raycast
 from tests.oracles.raycast import cast_walls
 from tests.worlds import CENTRE, l_room, rasterised_room
@@ -120,9 +120,23 @@ def test_nothing_valid_is_no_nan():
         assert np.isfinite(jnp.stack(found)).all()
 
 
-def sure(scores=(0.0, -5.0), explained=1.0, covariance=CERTAIN):
-    scores = jnp.asarray(scores, float)
-    return bool(trust(scores, jnp.asarray(explained, float), covariance))
+def sure(scores=(0.0, -5.0), covariance=CERTAIN, **best):
+    shares = {"explained": 1.0, "blocked": 0.0, "through": 0.0, **best}
+    shares = {name: jnp.asarray(value, float) for name, value in shares.items()}
+    score = jnp.asarray(scores, float)
+    best = Evidence(score=score[0], caer_per_ray=jnp.zeros(()), **shares)
+    return bool(trust(score, best, covariance))
+
+
+def test_people_in_the_way_are_forgiven_in_part():
+    """The same score and lead: a third of the rays cut short is a reason for it."""
+    scores = (-0.5, -0.8)
+    assert not sure(scores=scores)
+    assert sure(scores=scores, blocked=0.3)
+
+
+def test_rays_through_walls_are_not_forgiven():
+    assert not sure(through=0.2)
 
 
 def test_what_is_explained_fixed_and_alone_is_trusted():
