@@ -44,7 +44,7 @@ class SearchConfig(eqx.Module):
     """Headings of the exhaustive search, a multiple of 6."""
     ranked: int = eqx.field(static=True, default=1024)
     """Lattice poses that the panoramas turn and rank again."""
-    descended: int = eqx.field(static=True, default=192)
+    descended: int = eqx.field(static=True, default=144)
     """Candidates that descend on their end points."""
     polished: int = eqx.field(static=True, default=32)
     """Distinct candidates polished by their ranges."""
