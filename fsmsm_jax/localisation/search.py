@@ -183,22 +183,20 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
     descend = lambda pose: descend_end_points(world, descent_scan, pose, scales)
     poses = jax.vmap(descend)(poses[best])
     score = _judge(world, descent_scan, poses).score
-    poses, _ = _distinct(poses, score, config.polished, 0.25, 0.15)
+    poses = poses[_distinct(poses, score, config.polished, 0.25, 0.15)[0]]
 
     scales = jnp.array([0.4, 0.25, 0.2])
     polish = lambda pose: polish_ranges(world, ranking_scan, pose, scales)
     poses, thickness = jax.vmap(polish)(poses)
     score = _judge(world, ranking_scan, poses, thickness).score
-    poses, score = _distinct(poses, score, config.reported, 0.3, 0.25)
+    poses = poses[_distinct(poses, score, config.reported, 0.3, 0.25)[0]]
 
     scales = jnp.array([0.2, 0.15, 0.1])  # sharp: what is there decides
     polish = lambda pose: polish_ranges(world, scan, pose, scales)
     poses, thickness = jax.vmap(polish)(poses)
     evidence = _judge(world, scan, poses, thickness)
-    score = jnp.where(jnp.isneginf(score), score, evidence.score)
-    order = jnp.argsort(-score)
-    poses, score = poses[order], score[order]
-    evidence = jax.tree.map(lambda a: a[order], evidence)
+    order, score = _distinct(poses, evidence.score, config.reported, 0.3, 0.25)
+    poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
     scales = jnp.full(4, 0.3)  # wide: all good rays count, as the bound asks
     pose, thick = polish_ranges(world, scan, poses[0], scales)
     poses = poses.at[0].set(pose)
@@ -247,14 +245,17 @@ def _judge(world, scan, poses, thickness=None) -> Evidence:
 
 
 def _distinct(poses, score, count, distance, angle):
-    """The best poses, best first; those close to a better one sink with score −inf."""
+    """Indices of the best poses, best first, and their scores.
+
+    Those closer to a better one than `distance` [m] and `angle` [rad] sink with
+    score −inf.
+    """
     order = jnp.argsort(-score)
-    poses, score = poses[order], score[order]
-    apart = poses[:, None] - poses[None]
+    apart = poses[order][:, None] - poses[order][None]
     close = (jnp.linalg.norm(apart[..., :2], axis=-1) < distance) & (
         jnp.abs(geometry.wrap(apart[..., 2])) < angle
     )
     duplicate = jnp.any(close & jnp.tri(len(poses), k=-1, dtype=bool), axis=1)
-    score = jnp.where(duplicate, -jnp.inf, score)
+    score = jnp.where(duplicate, -jnp.inf, score[order])
     kept = jnp.argsort(-score)[:count]
-    return poses[kept], score[kept]
+    return order[kept], score[kept]
