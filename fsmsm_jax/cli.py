@@ -112,11 +112,11 @@ def demo(seed: int = 0, picture: Path = Path("demo.png")) -> None:
     world = office(seed)
     key_pose, key_scan = jax.random.split(jax.random.key(seed))
     truth = _random_pose(key_pose, world)
-    lidar = Lidar.create(rays=360, field_of_view=1.5 * np.pi, noise=0.02, outliers=0.3)
+    lidar = Lidar.create(rays=360, field_of_view=1.5 * np.pi, noise=0.02, outliers=0.2)
     scan = lidar.measure(key_scan, raycast(world, truth, lidar.bearings))
     print(f"map       an office floor out of seed {seed}, {_area(world):.0f} m² free")
     print(
-        f"scan      {_summary(scan)}, noise 2 cm, 30 % of the rays blocked", flush=True
+        f"scan      {_summary(scan)}, noise 2 cm, 20 % of the rays blocked", flush=True
     )
     scan_atlas, atlas_time = _timed(lambda: _atlas(world, 0.25, None))
     result, first, warm = _localise_twice(scan_atlas, scan)

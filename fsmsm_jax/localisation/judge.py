@@ -38,10 +38,8 @@ _EXPLAINED = (
     0.3  # [m]: a ray this close to the map, in range or at its end, is explained
 )
 
-_LEAD, _LEAD_PER_DOUBT = (
-    0.1,
-    0.5,
-)  # margin [nats a ray] of a sure answer: a + b·(−score)
+_LEAD = 0.15  # lead of a sure answer over its best rival [nats a ray]
+_LEAD_PER_DOUBT = 0.75  # more of it per nat that the answer itself falls short
 _MOST = 0.6  # share of the rays that a sure answer explains
 _HARDLY_ANY = 0.05  # share of its rays that may pass through walls
 _FIXED = 0.1  # [m]: standard deviation of the position of a sure answer

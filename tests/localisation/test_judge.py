@@ -130,7 +130,7 @@ def sure(scores=(0.0, -5.0), covariance=CERTAIN, **best):
 
 def test_people_in_the_way_are_forgiven_in_part():
     """The same score and lead: a third of the rays cut short is a reason for it."""
-    scores = (-0.5, -0.8)
+    scores = (-0.5, -0.9)
     assert not sure(scores=scores)
     assert sure(scores=scores, blocked=0.3)
 
