@@ -75,7 +75,7 @@ def polish_ranges(
     A map made from scans draws its walls some centimetres thick, and every virtual
     ray stops at the near face: too early, by b / |n·d|. That would push the pose
     away from whatever the sensor faces, so b is estimated along with the pose
-    (3 to 4 cm on maps of real buildings, nothing on true ones).
+    (centimetres on maps of real buildings, nothing on true ones).
 
     Args:
         world: the map.

@@ -34,10 +34,7 @@ _SIGMA = 0.1  # [m]: map and sensor errors of a ray that the map does explain
 _UNMAPPED, _TOO_SHORT, _TOO_LONG = 0.3, 0.1, 0.05  # ε, by what may have happened
 _NO_ECHO_WEIGHT = 0.1  # glass, black things and sky make missing echoes poor witnesses
 _THICKEST = 0.06  # [m]: walls drawn thicker than this are another place's walls
-_EXPLAINED = (
-    0.3  # [m]: a ray this close to the map, in range or at its end, is explained
-)
-
+_EXPLAINED = 0.3  # [m]: a ray that reads or ends this close to the map fits it
 _LEAD = 0.15  # lead of a sure answer over its best rival [nats a ray]
 _LEAD_PER_DOUBT = 0.75  # more of it per nat that the answer itself falls short
 _MOST = 0.6  # share of the rays that a sure answer explains
@@ -117,9 +114,9 @@ def trust(
         True if the best leads the runner-up by a margin, the wider the worse it
         explains the scan itself (people in the way are forgiven in part), if most
         rays are explained and hardly any passed through a wall, and if the position
-        is known to better than 0.1 m. The numbers were set on scans of five
-        buildings and of places off the map, where none was sure and wrong;
-        `scripts/bench_localisation.py` prints how they fare.
+        is known to better than 0.1 m. The numbers were set on the scans that
+        `scripts/bench_localisation.py` reports, none held out: they are cautious,
+        no guarantee.
     """
     lead = scores[0] - scores[1]
     doubt = jnp.maximum(-scores[0] - best.blocked, 0.0)
