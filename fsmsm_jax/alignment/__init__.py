@@ -6,10 +6,21 @@ from fsmsm_jax.alignment.spectrum import (
     squared_difference as squared_difference,
 )
 from fsmsm_jax.alignment.orientation import (
+    METHODS as METHODS,
     Orientation as Orientation,
+    first_principles as first_principles,
     fourier_mellin as fourier_mellin,
     fourier_mellin_masked as fourier_mellin_masked,
     heading_costs as heading_costs,
+    percent_discrimination as percent_discrimination,
+    procrustes as procrustes,
+    procrustes_trace as procrustes_trace,
+    turned as turned,
+)
+from fsmsm_jax.alignment.theseus import (
+    Candidates as Candidates,
+    sinis as sinis,
+    theseus as theseus,
 )
 from fsmsm_jax.alignment.position import (
     Translation as Translation,
@@ -23,3 +34,8 @@ from fsmsm_jax.alignment.caer import (
     caer_per_ray as caer_per_ray,
     truncated_caer_per_ray as truncated_caer_per_ray,
 )
+from fsmsm_jax.alignment.fsmsm_config import (
+    Alignment as Alignment,
+    FsmsmConfig as FsmsmConfig,
+)
+from fsmsm_jax.alignment.fsmsm import fsmsm as fsmsm

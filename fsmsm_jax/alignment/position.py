@@ -139,6 +139,8 @@ class Translation(NamedTuple):
     """Of the poses scanned (so not the last), the one with the least CAER."""
     caers: Float[Array, "iterations"]
     """CAER [m] at the start of each iteration, gated rays included."""
+    stayed: Bool[Array, ""]
+    """Whether every pose after a step lay inside the map and within `reach`."""
 
 
 def translate(
@@ -149,6 +151,7 @@ def translate(
     mask: Bool[Array, "rays"] | None = None,
     gate: float | Float[Array, ""] = math.inf,
     range_max: float | Float[Array, ""] = 30.0,
+    reach: float | Float[Array, ""] = math.inf,
 ) -> Translation:
     """Walk to where the virtual scan looks like the real one, heading held.
 
@@ -162,6 +165,8 @@ def translate(
             at first) do not move the pose. The thesis's program has 0.25; its text has
             no gate, which is infinity.
         range_max: cap of the virtual ranges [m], the sensor's own.
+        reach: how far from its start the pose may go [m], in x and in y; only noted,
+            in `stayed`.
 
     Example:
         >>> room = PolygonMap.from_outlines([[1, 1], [5, 1], [5, 4], [1, 4]])
@@ -178,7 +183,7 @@ def translate(
 
     Note:
         Linear convergence, about ½ an iteration. Nothing keeps the pose inside the
-        map: compare `caers`.
+        map: look at `stayed`.
     """
     rays = ranges.size
     bearings = _bearings(rays, pose.dtype)
@@ -196,11 +201,14 @@ def translate(
             u = masked_position_correction(ranges, mask, near, pose[2])
         u = jnp.where(length < _AT_REST, 0.0, u).astype(pose.dtype)
         after = pose.at[:2].add(u)
-        return (after, jnp.linalg.norm(u)), (pose, caer(ranges, virtual, mask))
+        near_start = jnp.all(jnp.abs(after[:2] - start[:2]) <= reach)
+        stayed = near_start & world.contains(after[:2])
+        return (after, jnp.linalg.norm(u)), (pose, caer(ranges, virtual, mask), stayed)
 
-    start = (pose, jnp.asarray(1 / rays, pose.dtype))
-    (last, _), (poses, caers) = jax.lax.scan(step, start, length=iterations)
-    return Translation(last, poses[jnp.argmin(caers)], caers)
+    start = pose
+    begin = (pose, jnp.asarray(1 / rays, pose.dtype))
+    (last, _), (poses, caers, stayed) = jax.lax.scan(step, begin, length=iterations)
+    return Translation(last, poses[jnp.argmin(caers)], caers, jnp.all(stayed))
 
 
 def _bearings(rays: int, dtype) -> Float[Array, "rays"]:

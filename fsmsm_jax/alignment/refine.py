@@ -13,8 +13,11 @@ non-convexity): people and moved furniture lose their vote as the pose settles.
 Everything is written for one pose; `vmap` refines many candidates at once.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from fsmsm_jax import geometry
@@ -23,11 +26,14 @@ from fsmsm_jax.sensing.raycast import raycast
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
 
-__all__ = ["covariance", "descend_end_points", "polish_ranges"]
+__all__ = ["covariance", "descend_end_points", "fit_ranges", "polish_ranges"]
 
 _DAMPING = 1e-2  # share of the rays' weight added to the diagonal of the end-point step
 _LONGEST_STEP = 0.3  # [m] and [rad] per iteration: the linearisation holds no farther
 _STEEPEST = 3.0  # cap of 1/|n·d|: at 70° and more the normal itself is uncertain
+_KERNEL = 4.0  # width of the kernel in standard deviations: hardly felt by noise
+_PARALLEL = np.cos(0.05)  # walls seen by neighbouring rays this parallel are one
+_TINY = 1e-4  # [m] added to a kernel's width, for scans without any noise
 _SECTORS = 36  # runs of rays whose errors are taken as shared
 _PRIOR_VARIANCE = (10.0**2, 10.0**2, 3.14**2, 0.05**2)  # of what nobody measured
 
@@ -96,6 +102,51 @@ def polish_ranges(
     return state[:3], state[3]
 
 
+def fit_ranges(
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    steps: int,
+    reach: float | Float[Array, ""] = math.inf,
+) -> Float[Array, "3"]:
+    r"""Robust Gauss-Newton on real minus virtual ranges, all noise unknown.
+
+    Two things spoil a residual e. The sensor's noise is the same for every ray and
+    new in every ray; a wall that stands elsewhere than drawn is shared by its rays
+    and grows with their slant s = 1/|n·d|. So rays are weighted by
+    $1/(1 - \rho + \rho s^2)$, with ρ the share of var(e) that neighbouring rays on
+    one wall have in common: 0 on a true map, where the fit then reaches the Cramér–Rao
+    bound. Both variances are read off the residuals, by medians, in every step. On
+    grids the thickness of drawn walls is estimated as well (see `polish_ranges`).
+
+    Args:
+        world: the map.
+        scan: the real scan, rays in order of bearing; echoes that the map explains
+            take part.
+        pose: guess [x, y, θ] of the lidar in the map, within some decimetres.
+        steps: how often to linearise; static.
+        reach: how far from the guess the answer may lie [m], in x and in y. Along a
+            narrow gap, walls drawn too close would let the pose slide without end.
+    """
+    drawn_thick = isinstance(world, OccupancyGrid)
+
+    def step(now, _):
+        e, J, known = _range_residuals(world, scan, now[:3], now[3])
+        slant = jnp.maximum(jnp.linalg.norm(J[:, :2], axis=1), 1.0)
+        J = J if drawn_thick else J.at[:, 3].set(0.0)
+        e = jnp.where(known, e, 0.0)
+        rho = _shared_variance(e, J, known)
+        weight = 1 / (1 - rho + rho * slant**2)
+        scaled = e * jnp.sqrt(weight)
+        width = _KERNEL * _scale(scaled, known) + _TINY
+        w = jnp.where(known, _geman_mcclure(scaled, width) * weight, 0.0)
+        after = _gauss_newton(now, e, J, w, 1e-6)
+        near = jnp.clip(after[:2], pose[:2] - reach, pose[:2] + reach)
+        return after.at[:2].set(near), None
+
+    return jax.lax.scan(step, jnp.append(pose, 0.0), length=steps)[0][:3]
+
+
 def covariance(
     world: OccupancyGrid | PolygonMap,
     scan: Scan,
@@ -122,8 +173,7 @@ def covariance(
     """
     e, J, known = _range_residuals(world, scan, pose, jnp.asarray(thickness))
     e, J = e / J[:, 3], J / J[:, 3:]
-    sigma = 1.4826 * jnp.nanmedian(jnp.where(known, jnp.abs(e), jnp.nan))
-    sigma = jnp.where(jnp.any(known), jnp.maximum(sigma, floor), floor)
+    sigma = jnp.maximum(_scale(e, known), floor)
     used = (known & (jnp.abs(e) < 3 * sigma))[:, None]
     J = jnp.where(used, J / sigma, 0.0)
     prior = jnp.diag(1 / jnp.sqrt(jnp.asarray(_PRIOR_VARIANCE, pose.dtype)))
@@ -158,6 +208,22 @@ def _range_residuals(world, scan, pose, thickness):
     e = scan.ranges - virtual - thickness * slant
     known = scan.echo & (virtual < scan.range_max)
     return e, jnp.concatenate([J, slant[:, None]], axis=1), known
+
+
+def _scale(e, known):
+    """Standard deviation that the median of |e| stands for; 0 if nothing is known."""
+    middle = jnp.nanmedian(jnp.where(known, jnp.abs(e), jnp.nan))
+    return jnp.where(jnp.any(known), 1.4826 * middle, 0.0)
+
+
+def _shared_variance(e, J, known):
+    """Share of the residuals' variance that is equal for neighbours on one wall."""
+    normal = J[:, :2] / jnp.maximum(jnp.linalg.norm(J[:, :2], axis=1), 1e-9)[:, None]
+    parallel = jnp.sum(normal * jnp.roll(normal, 1, axis=0), axis=1) > _PARALLEL
+    pair = known & jnp.roll(known, 1) & parallel
+    own = _scale(e - jnp.roll(e, 1), pair) ** 2 / 2
+    total = jnp.maximum(_scale(e, known) ** 2, 1e-12)
+    return jnp.where(jnp.any(pair), jnp.clip(1 - own / total, 0.0, 1.0), 0.0)
 
 
 def _geman_mcclure(e, scale):

@@ -32,6 +32,7 @@ __all__ = ["raycast"]
 _GRAZING = 0.1  # smallest |n·d|: rays within 6° of the wall have a capped derivative
 _CHUNK = 1 << 18  # rays marched together: their state fits the last-level cache
 _LEAF = 2048  # below this many rays compaction costs more than idle lanes
+_WALLS = 16  # walls met by each ray between two looks at memory
 _HOPS = 10  # hops before the first compaction: nine rays of ten are done by then
 
 
@@ -91,24 +92,46 @@ def _first_hit(world, position, headings, range_max):
 
 
 def _hit_segments(world, position, headings, range_max):
-    """Nearest intersection with any wall, its ends a and b seen from the sensor."""
-    along = jnp.stack([jnp.cos(headings), jnp.sin(headings)], axis=-1)
-    dx, dy = along[:, :1], along[:, 1:]  # rays down, walls across
-    ax, ay = (world.start - position[None, :]).T[:, None, :]
-    bx, by = (world.end - position[None, :]).T[:, None, :]
-    wx, wy = bx - ax, by - ay
-    cross = dx * wy - dy * wx
-    r = (ax * wy - ay * wx) / jnp.where(cross == 0, 1.0, cross)
-    # The ray's line parts the wall's ends. Two walls that meet in a corner ask this of
-    # the same corner by the same sum, so no ray slips through between them.
-    parted = (ax * dy - ay * dx >= 0) != (bx * dy - by * dx >= 0)
-    met = parted & (cross != 0) & (r >= 0)
-    r = jnp.where(met, r, jnp.inf)
-    nearest = jnp.argmin(r, axis=1)
-    r = jnp.take_along_axis(r, nearest[:, None], axis=1)[:, 0]
-    hit = r < range_max
-    normal = jnp.stack([wy[0, nearest], -wx[0, nearest]], axis=-1)
-    return jnp.where(hit, r, range_max), _towards_sensor(normal, along, hit)
+    """Nearest intersection with any wall, by the walls' polar duals.
+
+    Seen from the sensor, a wall from a to b lies on the line w · z = 1 with
+    w = (b_y − a_y, a_x − b_x) / (a × b), so along direction d it is met at
+    1 / r = w · d: no division a pair of ray and wall, and w is the normal as well.
+    """
+    dx, dy = jnp.cos(headings), jnp.sin(headings)
+    (ax, ay), (bx, by) = (
+        (world.start - position[None]).T,
+        (world.end - position[None]).T,
+    )
+    area = ax * by - ay * bx
+    inverse = jnp.where(area == 0, 0.0, 1 / jnp.where(area == 0, 1.0, area))
+    walls = jnp.stack([ax, ay, bx, by, (by - ay) * inverse, (ax - bx) * inverse])
+    count = walls.shape[1]
+    together = min(_WALLS, count)
+    blocks = -(-count // together)
+    walls = jnp.pad(walls, ((0, 0), (0, blocks * together - count)))
+
+    def block(nearest, walls):
+        # Unrolled, so that XLA keeps the rays in vector registers while walls pass.
+        for ax, ay, bx, by, wx, wy in walls.T:
+            closeness = dx * wx + dy * wy
+            # The ray's line parts the wall's ends. Two walls that meet in a corner ask
+            # this of the same corner by the same sum: no ray slips between them.
+            parted = (ax * dy - ay * dx >= 0) != (bx * dy - by * dx >= 0)
+            closer = parted & (closeness > nearest[0])
+            nearest = tuple(
+                jnp.where(closer, new, old)
+                for new, old in zip((closeness, wx, wy), nearest, strict=True)
+            )
+        return nearest, None
+
+    start = (jnp.zeros_like(dx),) * 3
+    blocks = walls.reshape(6, blocks, together).transpose(1, 0, 2)
+    (closeness, wx, wy), _ = jax.lax.scan(block, start, blocks)
+    hit = closeness * range_max > 1
+    ranges = jnp.where(hit, 1 / jnp.where(hit, closeness, 1.0), range_max)
+    along = jnp.stack([dx, dy], axis=-1)
+    return ranges, _towards_sensor(jnp.stack([wx, wy], axis=-1), along, hit)
 
 
 def _hit_cells(world, position, headings, range_max):

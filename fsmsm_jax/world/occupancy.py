@@ -155,10 +155,19 @@ class OccupancyGrid(eqx.Module):
         upper = (1 - u) * self.distance[j + 1, i] + u * self.distance[j + 1, i + 1]
         return (1 - v) * lower + v * upper
 
+    def contains(self, points: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
+        """Whether map-frame points [m] lie on the map and not in an obstacle."""
+        cell, inside = self._cell_at(points)
+        return inside & (cell < _OCCUPIED_PERCENT)
+
     def unknown_at(self, points: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
         """Whether map-frame points [m] lie in unknown cells or off the map."""
+        cell, inside = self._cell_at(points)
+        return ~inside | (cell < 0)
+
+    def _cell_at(self, points):
+        """The cells that points lie in, the nearest if off the map, and which are on."""
         height, width = self.cells.shape
         column, row = jnp.moveaxis(jnp.floor(self.to_cells(points)).astype(int), -1, 0)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        cell = self.cells[row.clip(0, height - 1), column.clip(0, width - 1)]
-        return ~inside | (cell < 0)
+        return self.cells[row.clip(0, height - 1), column.clip(0, width - 1)], inside

@@ -1,7 +1,7 @@
 """Alignment as one would do it by hand: loops over rays and shifts, in float64.
 
-Written from the definitions (thesis eq. 4.30, 6.32 and errata E1, E9), not from the
-package: no FFT, no closed forms.
+Written from the definitions (thesis eq. 4.20, 4.30, 6.32 and errata E1, E9, E11), not
+from the package: no FFT, no closed forms.
 """
 
 import cmath
@@ -20,6 +20,28 @@ def correlation(r, v):
     return np.array(
         [sum(r[n] * v[(n + k) % n_s] for n in range(n_s)) for k in range(n_s)]
     )
+
+
+def procrustes_traces(r, v):
+    """Largest trace tr(R P_V^k P_R^T) over the rotations R, by one SVD a shift k."""
+    n_s = len(r)
+    bearings = [2 * math.pi * n / n_s - math.pi for n in range(n_s)]
+    directions = np.array(
+        [[math.cos(a) for a in bearings], [math.sin(a) for a in bearings]]
+    )
+    points_r, points_v = r * directions, v * directions
+    traces = []
+    for k in range(n_s):
+        U, D, Vt = np.linalg.svd(np.roll(points_v, -k, axis=1) @ points_r.T)
+        traces.append(D[0] + np.linalg.det(U @ Vt) * D[1])
+    return np.array(traces)
+
+
+def bisect(r, nu):
+    """Sinis: nu times, a ray of the mean range between every two neighbours."""
+    for _ in range(nu):
+        r = [x for n in range(len(r)) for x in (r[n], (r[n] + r[(n + 1) % len(r)]) / 2)]
+    return r
 
 
 def squared_difference(r, mask_r, v, mask_v):
