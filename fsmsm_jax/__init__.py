@@ -10,7 +10,7 @@ A tour of the house, in the order in which data passes through it:
   any scan to equiangular rays.
 - `alignment`: one scan against another. Orientation by circular correlation, position
   by the first harmonic, `caer` for how alike two scans are, and descent on exact
-  derivatives.
+  derivatives. `match` puts them together: a scan, a map, and about where.
 - `localisation`: where am I. `build_atlas` scans a map once; `localise` finds one
   scan in it, `localise_batch` many.
 - `evaluation`, `io`, `plotting` and the `fsmsm` command line stand at the edge.
@@ -33,7 +33,13 @@ from fsmsm_jax.sensing import (
     panorama as panorama,
     raycast as raycast,
 )
-from fsmsm_jax.alignment import caer_at
+from fsmsm_jax.alignment import (
+    FsmsmConfig as FsmsmConfig,
+    Match as Match,
+    caer_at,
+    match as match,
+    match_batch as match_batch,
+)
 from fsmsm_jax.localisation import (
     AtlasConfig as AtlasConfig,
     Localisation as Localisation,

@@ -1,5 +1,6 @@
 import json
 import re
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from fsmsm_jax.world.buildings import office
 from fsmsm_jax.world.ros_map import save_map
 
 TRUTH = jnp.array([7.5, 4.0, 0.8])
+NEAR = (7.62, 3.9, 62.0)  # m, m, degrees
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +107,75 @@ def test_errors_are_one_line_and_status_two(recorded, capsys, options, message):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("fsmsm: error: ")
     assert message in line
+
+
+def match(folder, *options, near=NEAR):
+    files = [str(folder / "map.yaml"), str(folder / "log.npz")]
+    initial = ["--initial", *(f"{number:.4f}" for number in near)]
+    return cli.main(["match", *files, *initial, "--index", "1", *options])
+
+
+def test_match_says_what_the_scan_makes_of_an_estimate(recorded, capsys, tmp_path):
+    assert match(recorded) == 0
+    out = capsys.readouterr().out
+    pose = re.search(r"pose      x (\S+) m ± \S+, y (\S+) m ± \S+, heading (\S+)°", out)
+    found = np.array([float(group) for group in pose.groups()])
+    np.testing.assert_allclose(found[:2], TRUTH[:2], atol=0.03)
+    np.testing.assert_allclose(np.deg2rad(found[2]), TRUTH[2], atol=0.01)
+    caer = re.search(r"converged in \d+ iterations.*CAER (\S+) → (\S+) cm", out)
+    before, after = (float(group) for group in caer.groups())
+    assert after < before / 5
+    for word in ("initial   x 7.620 m", "1σ", " ms", "picture   match.png"):
+        assert word in out
+    assert (tmp_path / "match.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_match_answers_programs_too(recorded, capsys, tmp_path):
+    assert match(recorded, "--json", "--picture", "none") == 0
+    answer = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(answer["pose"], TRUTH, atol=0.03)
+    assert np.shape(answer["covariance"]) == (3, 3)
+    assert answer["converged"] is True
+    assert answer["caer_per_ray"] < answer["caer_before"]
+    assert answer["seconds"].keys() == {"first_match", "match"}
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"near": (70, 4, 40)}, "off the map or inside a wall"),
+        ({"near": (float("nan"), 4, 40)}, "finite numbers"),
+        ({"rays": 3}, "at least 8 rays"),
+    ],
+)
+def test_an_estimate_that_helps_nobody_is_an_error(recorded, capsys, options, message):
+    rays = ["--rays", str(options.pop("rays", 360))]
+    assert match(recorded, *rays, **options) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("fsmsm: error: ")
+    assert message in line
+
+
+def test_match_as_published_is_told_the_noise(recorded, monkeypatch):
+    configs = []
+
+    def give_up(world, scan, pose, config, *, rays):
+        configs.append(config)
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr(sys.modules["fsmsm_jax.cli.match"], "match_scan", give_up)
+    assert match(recorded, "--published", "0.05", near=(-7.0, 3.9, 62.0)) == 2
+    assert configs[0].levels == (2, 3, 4, 5)
+    assert configs[0].finish == 0
+    np.testing.assert_allclose(configs[0].caer_limit, 4 * 0.05 + 0.001, rtol=1e-6)
+
+
+def test_match_needs_an_estimate(recorded, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main(["match", str(recorded / "map.yaml"), str(recorded / "log.npz")])
+    assert exit_info.value.code == 2
+    assert "--initial" in capsys.readouterr().err
 
 
 def test_missing_files_are_named(recorded, capsys):

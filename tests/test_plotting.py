@@ -163,3 +163,86 @@ def test_lone_candidate_far_truth_and_boundless_covariance(ax):
     labels = [text.get_text() for text in building.texts]
     assert "truth" in labels
     assert "2" not in labels
+
+
+# --- The thesis's figures -----------------------------------------------------------
+
+
+def test_boxes_are_the_quartiles_in_the_axis_unit_and_published_marks_are_as_given(ax):
+    sample = np.arange(1, 102) * 1e-3
+    errors = {"ours": [sample, 2 * sample], "fm": [sample, sample]}
+    boxes = plotting.plot_errors(
+        ax, errors, ["a", "b"], {"fm": [(20.0, 30.0), (40.0, 50.0)]}
+    )
+    assert list(boxes) == ["ours", "fm"]
+    for box, middle in zip(boxes["ours"]["medians"], (51.0, 102.0), strict=True):
+        np.testing.assert_allclose(box.get_ydata(), middle)
+    low, high = boxes["fm"]["whiskers"][0], boxes["fm"]["whiskers"][1]
+    assert low.get_ydata().min() == pytest.approx(6.0)
+    assert high.get_ydata().max() == pytest.approx(96.0)
+    published = [line for line in ax.lines if line.get_marker() in ("_", "x")]
+    assert [list(line.get_ydata()) for line in published] == [[20, 40], [30, 50]]
+    ours, theirs = (boxes[name]["medians"][0].get_xdata().mean() for name in boxes)
+    assert ours < 0 < theirs < published[0].get_xdata()[0] < 0.5
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["a", "b"]
+
+
+def test_the_most_similar_candidate_of_each_case_is_the_one_in_colour(ax):
+    error = np.array([[-0.002, 0.001, 0.004], [0.02, 0.01, -0.03]])
+    similarity = np.array([[0.9, 0.99, 1.0], [0.7, 0.5, 0.6]])
+    every, chosen = plotting.plot_similarity(ax, error, similarity)
+    np.testing.assert_allclose(chosen.get_offsets(), [[4, 1e-8], [20, 0.3]], rtol=1e-6)
+    assert len(every.get_offsets()) == 6
+    assert (every.get_offsets() > 0).all()  # on logarithmic axes
+
+
+def test_caer_is_counted_and_its_medians_follow_it(ax):
+    error = np.linspace(0.001, 0.8, 4000)
+    caer = 0.1 + error
+    caer[::100] = np.inf  # no valid ray: not drawn
+    mesh, line = plotting.plot_caer(ax, error, caer, bands=8)
+    assert mesh.get_array().sum() == pytest.approx(0.99 * 4000, rel=0.005)
+    np.testing.assert_allclose(line.get_ydata(), 0.1 + line.get_xdata(), atol=0.01)
+
+
+def test_lonely_bands_have_no_median(ax):
+    error = np.append(np.full(50, 0.1), [0.8])
+    _, line = plotting.plot_caer(ax, error, np.linspace(0.1, 0.2, 51), bands=4)
+    assert np.isfinite(line.get_ydata()).tolist() == [True, False, False, False]
+
+
+def test_convergence_shows_the_median_and_not_too_many_cases(ax):
+    errors = np.outer(np.arange(1, 202), 0.5 ** np.arange(5))
+    trails, median = plotting.plot_convergence(ax, errors, "walk", scale=1e3)
+    np.testing.assert_allclose(median.get_ydata(), 101e3 * 0.5 ** np.arange(5))
+    assert 10 < len(trails.get_segments()) <= 60
+    assert median.get_label() == "walk"
+    assert ax.get_yscale() == "log"
+
+
+def test_path_starts_in_its_ring(ax):
+    poses = jnp.array([[4.0, -4.0, 0.1], [2.0, -2.0, 0.2], [1.0, -1.0, 0.3]])
+    way, ring = plotting.plot_path(ax, poses)
+    np.testing.assert_allclose(way.get_xydata(), poses[:, :2])
+    np.testing.assert_allclose(ring.get_xydata(), poses[:1, :2])
+
+
+def test_sweep_has_its_intervals_and_the_published_values_it_covers(ax):
+    y = np.array([8.0, 4.0, 2.0])
+    low, high = np.array([6.0, -1.0, -np.inf]), np.array([9.0, 7.0, np.inf])
+    drawn = plotting.plot_sweep(
+        ax, range(3), y, "uf", interval=(low, high), published=[9.0, 5.0, 3.0, 1.0]
+    )
+    assert drawn.has_yerr
+    ends = [segment[:, 1].tolist() for segment in drawn[2][0].get_segments()]
+    assert ends == [[6, 9], [4, 7], [2, 2]]  # what cannot be drawn is not
+    (theirs,) = (line for line in ax.lines if line.get_label() == "uf, thesis")
+    assert theirs.get_ydata().tolist() == [9, 5, 3]
+
+
+def test_short_logarithmic_axes_have_numbers_and_no_exponents(ax):
+    plotting.plot_sweep(ax, [0, 1], [0.4, 4.0])
+    ax.figure.savefig(import_module("io").BytesIO())
+    labels = {text.get_text() for text in ax.get_yticklabels(which="both")}
+    assert {"0.5", "1", "2"} <= labels
+    assert not any("^" in label for label in labels)

@@ -39,3 +39,8 @@ from fsmsm_jax.alignment.fsmsm_config import (
     FsmsmConfig as FsmsmConfig,
 )
 from fsmsm_jax.alignment.fsmsm import fsmsm as fsmsm
+from fsmsm_jax.alignment.match import (
+    Match as Match,
+    match as match,
+    match_batch as match_batch,
+)

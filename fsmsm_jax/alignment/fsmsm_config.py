@@ -40,7 +40,7 @@ class FsmsmConfig(eqx.Module):
     """What is remembered of the best rehearsal so far: its "heading" (the thesis's
     text), the "turn" that led to it (its program for fm and uf, erratum E14), or its
     "pose" after the rehearsal, from which every step then goes on (its program for
-    x1)."""
+    x1; the better choice for "first_principles")."""
     keep_least: bool = eqx.field(default=True, static=True)
     """Of the positions on the way keep the one of least CAER, and not the last."""
     gate: ScalarLike = 0.25
@@ -51,7 +51,7 @@ class FsmsmConfig(eqx.Module):
     """Recover beyond this many boxes from the first estimate."""
     caer_limit: ScalarLike = math.inf
     """CAER per ray [m] above which the last level ends in a recovery."""
-    max_recoveries: int = eqx.field(default=10, static=True)
+    max_recoveries: int = eqx.field(default=40, static=True)
     """Fresh starts before giving up."""
 
     def __check_init__(self):

@@ -32,7 +32,7 @@ __all__ = ["raycast"]
 _GRAZING = 0.1  # smallest |n·d|: rays within 6° of the wall have a capped derivative
 _CHUNK = 1 << 18  # rays marched together: their state fits the last-level cache
 _LEAF = 2048  # below this many rays compaction costs more than idle lanes
-_WALLS = 16  # walls met by each ray between two looks at memory
+_WALLS = 4  # walls met between two looks at memory; more compile slower, not run faster
 _HOPS = 10  # hops before the first compaction: nine rays of ten are done by then
 
 

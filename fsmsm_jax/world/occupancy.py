@@ -166,7 +166,7 @@ class OccupancyGrid(eqx.Module):
         return ~inside | (cell < 0)
 
     def _cell_at(self, points):
-        """The cells that points lie in, the nearest if off the map, and which are on."""
+        """Each point's cell, the nearest one if it is off the map, and if it is on."""
         height, width = self.cells.shape
         column, row = jnp.moveaxis(jnp.floor(self.to_cells(points)).astype(int), -1, 0)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

@@ -1,12 +1,10 @@
-"""Pictures: each function draws one thing on an Axes that you bring, and returns it.
+"""Where am I: the map, the scan on it, and how sure the answer is.
 
-They stack: `plot_world` first, which also frames the map, then scans, poses and
-ellipses in any order. All take map-frame metres, so a turned map (origin with yaw) and
-everything on it stay together. `plot_localisation` composes them into the picture that
-answers "where am I?" on three scales: the building, the room, and the centimetres of
-the covariance ellipse.
-
-Import this module by its name; `import fsmsm_jax` alone does not load matplotlib.
+The functions stack: `plot_world` first, which also frames the map, then scans, poses
+and ellipses in any order. All take map-frame metres, so a turned map (origin with yaw)
+and everything on it stay together. `plot_localisation` composes them into the picture
+that answers "where am I?" on three scales: the building, the room, and the centimetres
+of the covariance ellipse.
 """
 
 import numpy as np

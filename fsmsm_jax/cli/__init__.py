@@ -1,0 +1,60 @@
+"""The command line: `fsmsm localise MAP LOG`, `match`, and `demo` to see it work.
+
+All end in a picture. `localise` reads a map_server map and one scan of a log (rosbag,
+CARMEN or .npz) and says where it was taken, how surely, and what else it could have
+been; `match` says so more quickly where a first estimate is at hand. `--json` says it
+to a program. Text and JSON go to stdout, progress to stderr. An error is one line on
+stderr and exit status 2.
+
+Compiled programs are kept in $XDG_CACHE_HOME/fsmsm_jax (~/.cache/fsmsm_jax), which
+takes seconds off every run but the first; FSMSM_NO_CACHE=1 turns that off, and
+JAX_COMPILATION_CACHE_DIR moves it.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import tyro
+
+from fsmsm_jax.cli.localise import localise
+from fsmsm_jax.cli.match import match
+from fsmsm_jax.cli.demo import demo
+
+__all__ = ["demo", "localise", "main", "match"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status is 0, or 2 after an error."""
+    try:
+        _keep_compiled_programs()
+        tyro.extras.subcommand_cli_from_dict(
+            {"localise": localise, "match": match, "demo": demo},
+            prog="fsmsm",
+            description="Where is my lidar? 2D lidar localisation against a map.",
+            args=arguments,
+            config=(
+                tyro.conf.FlagCreatePairsOff,
+                tyro.conf.PositionalMetavarFromFieldName,
+            ),
+        )
+    except (ValueError, OSError, ImportError) as error:
+        print(f"fsmsm: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _keep_compiled_programs() -> None:
+    """Point JAX's compilation cache at the user's folder, if that can be written."""
+    if {"FSMSM_NO_CACHE", "JAX_COMPILATION_CACHE_DIR"} & os.environ.keys():
+        return
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(root) / "fsmsm_jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

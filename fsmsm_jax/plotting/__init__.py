@@ -1,0 +1,29 @@
+"""Pictures: each function draws one thing on an Axes that you bring, and returns it.
+
+`localisation` shows one answer on its map; `thesis` shows what many answers are worth:
+the figures of the published evaluation, with the published numbers on them.
+
+Import this package by its name; `import fsmsm_jax` alone does not load matplotlib.
+"""
+
+from fsmsm_jax.plotting.localisation import (
+    POSE as POSE,
+    RIVAL as RIVAL,
+    SCAN as SCAN,
+    TRUTH as TRUTH,
+    UNKNOWN as UNKNOWN,
+    WALL as WALL,
+    plot_covariance as plot_covariance,
+    plot_localisation as plot_localisation,
+    plot_pose as plot_pose,
+    plot_scan as plot_scan,
+    plot_world as plot_world,
+)
+from fsmsm_jax.plotting.thesis import (
+    plot_caer as plot_caer,
+    plot_convergence as plot_convergence,
+    plot_errors as plot_errors,
+    plot_path as plot_path,
+    plot_similarity as plot_similarity,
+    plot_sweep as plot_sweep,
+)

@@ -1,0 +1,48 @@
+"""The scripts still run: a few of everything, with recordings and without."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_reproduce_thesis_quickly(tmp_path):
+    """Where nothing is recorded, so that it runs everywhere; the tables say so."""
+    nothing = {"FSMSM_DATA": str(tmp_path / "no"), "FSMSM_GOLDEN": str(tmp_path / "no")}
+    page, pictures = tmp_path / "thesis.md", tmp_path / "pictures"
+    command = [sys.executable, "scripts/reproduce_thesis.py", "--quick"]
+    run = subprocess.run(
+        [*command, "--markdown", str(page), "--out", str(pictures)],
+        cwd=ROOT,
+        env=os.environ | nothing,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "generated offices" in run.stdout
+    tables = page.read_text()
+    for title in (
+        "Main evaluation: errors",
+        "Main evaluation: cost",
+        "Orientation alone, no noise",
+        "The position law alone",
+        "CAER against pose error",
+        "The largest sampling degree",
+        "A shorter reach",
+        "Milliseconds a match",
+    ):
+        assert f"### {title}" in tables
+        assert title in run.stdout
+    assert "author's C++" not in tables  # its results are not at hand
+    assert {path.stem for path in pictures.iterdir()} == {
+        "similarity",
+        "position",
+        "caer",
+        "degrees",
+    }
+    assert all(path.stat().st_size < 200_000 for path in pictures.iterdir())
