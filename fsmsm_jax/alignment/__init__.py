@@ -19,6 +19,7 @@ from fsmsm_jax.alignment.orientation import (
 )
 from fsmsm_jax.alignment.theseus import (
     Candidates as Candidates,
+    distinct_headings as distinct_headings,
     sinis as sinis,
     theseus as theseus,
 )

@@ -28,7 +28,7 @@ from fsmsm_jax.alignment.fsmsm_config import Alignment, FsmsmConfig
 from fsmsm_jax.alignment.position import translate
 from fsmsm_jax.alignment.refine import fit_ranges
 from fsmsm_jax.alignment.rounds import in_rounds
-from fsmsm_jax.alignment.theseus import theseus
+from fsmsm_jax.alignment.theseus import distinct_headings, theseus
 from fsmsm_jax.sensing import Scan, raycast
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
@@ -164,6 +164,7 @@ def _outer_step(index, state, job, *, config, shared, range_max):
         gate=config.gate,
         range_max=range_max,
         reach=config.box[0] + _SLACK,
+        cap=config.cap,
     )
     valid = job.ranges.size if job.mask is None else jnp.maximum(jnp.sum(job.mask), 1)
 
@@ -217,10 +218,17 @@ def _candidates(config, nu, world, range_max, state, job):
     bearings = np.linspace(-np.pi, np.pi, rays * steps, endpoint=False)
     bearings = jnp.asarray(bearings, state.pose.dtype)
     fine = raycast(world, state.pose, bearings, range_max)
-    found = theseus(job.ranges, fine, config.orientation, job.mask)
+    if config.headings and config.orientation == "fourier_mellin":
+        away = geometry.wrap(job.start[2] - state.pose[2])
+        half = config.stray * config.box[1]
+        found = distinct_headings(
+            job.ranges, fine, away, half, config.headings, config.apart, job.mask
+        )
+    else:
+        found = theseus(job.ranges, fine, config.orientation, job.mask)
+    near = jnp.arange(len(found.corrections))
     beside = config.window >> nu
-    near = jnp.arange(steps)
-    if 2 * beside + 1 < steps and config.orientation != "first_principles":
+    if 2 * beside + 1 < len(near) and config.orientation != "first_principles":
         near = jnp.argmax(found.similarity) + jnp.arange(-beside, beside + 1)
         near = jnp.sort(near % steps)
     at = jnp.broadcast_to(state.pose[None, :2], (len(near), 2))

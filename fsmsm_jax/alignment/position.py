@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fsmsm_jax.alignment.caer import caer
 from fsmsm_jax.alignment.spectrum import first_harmonic
 from fsmsm_jax.sensing import raycast
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
@@ -152,6 +151,7 @@ def translate(
     gate: float | Float[Array, ""] = math.inf,
     range_max: float | Float[Array, ""] = 30.0,
     reach: float | Float[Array, ""] = math.inf,
+    cap: float | Float[Array, ""] = math.inf,
 ) -> Translation:
     """Walk to where the virtual scan looks like the real one, heading held.
 
@@ -167,6 +167,8 @@ def translate(
         range_max: cap of the virtual ranges [m], the sensor's own.
         reach: how far from its start the pose may go [m], in x and in y; only noted,
             in `stayed`.
+        cap: rays that differ by more [m] never move the pose, and count no more than
+            this in CAER: people, open doors, glass.
 
     Example:
         >>> room = PolygonMap.from_outlines([[1, 1], [5, 1], [5, 4], [1, 4]])
@@ -193,6 +195,7 @@ def translate(
         virtual = raycast(world, pose, bearings, range_max)
         bound = gate * rays * jnp.maximum(length, jnp.finfo(length.dtype).tiny)
         bound += jnp.where(bound < 1e-4, 1.0, 1e-6)
+        bound = jnp.minimum(bound, cap)
         # A gated ray agrees by decree: it does not pull, but still counts in 1/N.
         near = jnp.where(jnp.abs(ranges - virtual) <= bound, virtual, ranges)
         if mask is None:
@@ -203,7 +206,8 @@ def translate(
         after = pose.at[:2].add(u)
         near_start = jnp.all(jnp.abs(after[:2] - start[:2]) <= reach)
         stayed = near_start & world.contains(after[:2])
-        return (after, jnp.linalg.norm(u)), (pose, caer(ranges, virtual, mask), stayed)
+        off = jnp.minimum(jnp.abs(ranges - virtual), cap)
+        return (after, jnp.linalg.norm(u)), (pose, jnp.sum(off, where=mask), stayed)
 
     start = pose
     begin = (pose, jnp.asarray(1 / rays, pose.dtype))

@@ -35,10 +35,14 @@ from fsmsm_jax.alignment.orientation import (
     METHODS,
     Orientation,
     fourier_mellin_masked,
+    heading_costs,
     turned,
 )
+from fsmsm_jax.alignment.spectrum import Spectrum
 
-__all__ = ["Candidates", "sinis", "theseus"]
+__all__ = ["Candidates", "distinct_headings", "sinis", "theseus"]
+
+_NEAR = 0.3  # [m] added to a range before its logarithm is taken
 
 
 class Candidates(NamedTuple):
@@ -118,6 +122,64 @@ def theseus(
     offsets = jnp.arange(steps) * (2 * jnp.pi / fine_virtual.size)
     corrections = geometry.wrap(corrections + offsets.astype(ranges.dtype))
     return Candidates(corrections, similarity, disagreement)
+
+
+def distinct_headings(
+    ranges: Float[Array, "rays"],
+    fine_virtual: Float[Array, "fine"],
+    centre: float | Float[Array, ""],
+    half_width: float | Float[Array, ""],
+    count: int,
+    apart: float | Float[Array, ""],
+    mask: Bool[Array, "rays"] | None = None,
+) -> Candidates:
+    """The best heading corrections in a sector that are apart from each other.
+
+    Theseus looks about one peak; a square room has four alike and a corridor two. Here
+    all 2^ν N headings are compared, by the mean squared difference of log(range + 0.3),
+    for which a metre counts less the farther it is: no long ray votes like fifty.
+
+    Args:
+        ranges: real scan [m], ray n at bearing −π + 2πn/N.
+        fine_virtual: one cast [m] with 2^ν N rays, as in `theseus`.
+        centre: middle of the corrections that are possible [rad].
+        half_width: how far from it they may lie [rad].
+        count: how many to find; static. The best is repeated if there are fewer.
+        apart: least angle between two of them [rad].
+        mask: valid rays of the real scan; all if left out.
+
+    Returns:
+        The candidates, best first. Their similarity is 1 / (1 + cost), their `caer`
+        the cost itself, of logarithms.
+
+    Raises:
+        ValueError: the fine scan has not 2^ν times as many rays.
+
+    Example:
+        >>> wave = 3 + jnp.cos(jnp.arange(36) * jnp.pi / 9)  # twice round: two answers
+        >>> found = distinct_headings(wave, jnp.roll(wave, 3), 0.0, 4.0, 2, 0.5)
+        >>> sorted(round(float(c), 2) for c in found.corrections)
+        [-2.62, 0.52]
+    """
+    steps = _steps(ranges, fine_virtual)
+    everywhere = jnp.ones(ranges.shape, bool)
+    compress = lambda ranges: jnp.log(ranges + _NEAR)
+    R = Spectrum.of(compress(ranges), everywhere if mask is None else mask)
+    cost = lambda v: heading_costs(R, Spectrum.of(compress(v), everywhere))
+    costs = jax.vmap(cost)(fine_virtual.reshape(ranges.size, steps).T).T.reshape(-1)
+    turns = jnp.arange(fine_virtual.size) * (2 * jnp.pi / fine_virtual.size)
+    turns = turns.astype(ranges.dtype)
+    possible = jnp.abs(geometry.wrap(turns - centre)) <= half_width
+    costs = jnp.where(possible, costs, jnp.inf)
+
+    def take_best(costs, _):
+        best = jnp.argmin(costs)
+        beside = jnp.abs(geometry.wrap(turns - turns[best])) < apart
+        return jnp.where(beside, jnp.inf, costs), (turns[best], costs[best])
+
+    _, (found, least) = jax.lax.scan(take_best, costs, length=count)
+    found = jnp.where(jnp.isfinite(least), found, found[0])
+    return Candidates(geometry.wrap(found), 1 / (1 + least), least)
 
 
 def sinis(

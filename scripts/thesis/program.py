@@ -31,15 +31,15 @@ def golden(options: Options) -> Iterator[Table]:
         arrays = {name: file[name] for name in file.files}
     program = _program_results(folder / "fsm_bench.csv")
     methods = [name for name in options.methods if name in _PROGRAM]
-    rows, found = [], {}
+    found = {}
     for name in methods[:1] if options.quick else methods:
         cells = sorted({key[1:] for key in program if key[0] == _PROGRAM[name]})
+        rows = []
         for cell in ((0.05, 0.0),) if options.quick else cells:
             theirs = program[_PROGRAM[name], *cell]
             ids = sorted(theirs)[: options.worlds if options.quick else None]
             index = np.searchsorted(arrays["dataset_id"], ids)
-            exact = cell[0] == 0
-            cases = published_cases(arrays, exact_ranges=exact)
+            cases = published_cases(arrays, exact_ranges=cell[0] == 0)
             cases = jax.tree.map(lambda a, i=index: a[i], cases)
             results = np.array([theirs[i] for i in ids]).T
             for ours in (name, OURS):
@@ -47,11 +47,14 @@ def golden(options: Options) -> Iterator[Table]:
                 # Every method was asked the same cases, so ours need not be twice.
                 key = ours, cell, tuple(ids)
                 found[key] = found.get(key) or one_row(cases, ours, *cell).row
-                rows.append(_paired(found[key], name, ours, cell, results))
-    yield Table(
-        "The author's C++ on the same cases",
+                rows.append(_paired(found[key], ours, cell, results))
+        yield _table(name, rows)
+
+
+def _table(name: str, rows: list[tuple[str, ...]]) -> Table:
+    return Table(
+        f"The author's C++ on the same cases: {name} ({_PROGRAM[name]})",
         (
-            "C++",
             "ours",
             "σ_R [m]",
             "σ_M [m]",
@@ -87,13 +90,12 @@ def _program_results(path: Path) -> dict[tuple[str, float, float], dict[int, tup
     return dict(results)
 
 
-def _paired(row: Row, name, ours, cell, results) -> tuple[str, ...]:
+def _paired(row: Row, ours, cell, results) -> tuple[str, ...]:
     position, orientation, *start = results
     better = np.hypot(position, orientation) < np.hypot(*start)
     middle = lambda e: pair((np.median(e), np.mean(e)), 1e3)
     same = np.abs(row.errors.position - position) < 1e-3
     return (
-        f"{name} ({_PROGRAM[name]})",
         "default" if ours == OURS else "published",
         f"{cell[0]:g}",
         f"{cell[1]:g}",

@@ -131,10 +131,12 @@ class Matcher:
     def __call__(self, worlds, ranges, poses) -> Alignment:
         arguments = (worlds, ranges, poses, *self.arguments)
         shapes = tuple(a.shape for a in jax.tree.leaves(arguments))
+        # The many candidates of a published step fill the cores by themselves.
+        block = 32 if self.arguments[0].finish else 8
         program = jax.tree.structure(arguments), shapes
         if program not in _compiled:
             start = time.perf_counter()
-            lowered = _match.lower(*arguments, block=32)
+            lowered = _match.lower(*arguments, block=block)
             _compiled[program] = lowered.compile()
             self.compile_seconds = time.perf_counter() - start
         start = time.perf_counter()

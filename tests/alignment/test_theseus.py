@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from fsmsm_jax.alignment.orientation import METHODS, fourier_mellin
-from fsmsm_jax.alignment.theseus import sinis, theseus
+from fsmsm_jax.alignment.theseus import distinct_headings, sinis, theseus
 from fsmsm_jax.sensing import raycast
 from fsmsm_jax.world import PolygonMap
 from tests.oracles import alignment as oracle
-from tests.worlds import CENTRE, l_room
+from tests.worlds import CENTRE, l_room, square_room
 
 RAYS = 360
 GAMMA = 2 * np.pi / RAYS
@@ -244,3 +244,19 @@ def test_dtypes_are_kept_under_x64():
             scans = jnp.ones(16, dtype), jnp.ones(64, dtype)
             leaves = jax.tree.leaves(jax.eval_shape(answers, *scans))
             assert {leaf.dtype for leaf in leaves} == {np.dtype(dtype)}
+
+
+def test_distinct_headings_finds_all_four_of_a_square_and_only_those_allowed():
+    room = square_room()
+    pose = jnp.array([*CENTRE, 0.2])
+    bearings = jnp.linspace(-jnp.pi, jnp.pi, 4 * 90, endpoint=False)
+    real = raycast(room, pose.at[2].add(0.3), bearings[::4])
+    fine = raycast(room, pose, bearings)
+    found = distinct_headings(real, fine, 0.0, 4.0, 4, 0.5)
+    quarters = np.sort(np.mod(np.asarray(found.corrections) - 0.3, np.pi / 2))
+    half_a_ray = np.pi / 4 / 90
+    assert np.minimum(quarters, np.pi / 2 - quarters).max() <= half_a_ray + 1e-5
+    assert np.unique(np.round(found.corrections, 1)).size == 4
+    allowed = distinct_headings(real, fine, 0.0, 0.7, 4, 0.5)
+    assert np.abs(allowed.corrections - 0.3).min() <= half_a_ray + 1e-5
+    assert np.abs(allowed.corrections).max() <= 0.7
