@@ -2,9 +2,12 @@
 
 Rank promotion is an error here: `(n,) + (m, n)` is nearly always a forgotten axis.
 Hypothesis is made repeatable and patient (the first example pays for a compile).
+Compiled programs are dropped after each file: each holds some ten memory maps, and
+a process that reaches the kernel's 65 530 (vm.max_map_count) dies inside LLVM.
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -17,6 +20,12 @@ settings.register_profile(
     "fixed", deadline=None, derandomize=True, database=None, max_examples=50
 )
 settings.load_profile("fixed")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _drop_compiled() -> Iterator[None]:
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -24,9 +24,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, ScalarLike
 
 from fsmsm_jax import geometry
 from fsmsm_jax.alignment.caer import caer_per_ray
+from fsmsm_jax.alignment.fit import fit_ranges
 from fsmsm_jax.alignment.fsmsm_config import Alignment, FsmsmConfig
 from fsmsm_jax.alignment.position import translate
-from fsmsm_jax.alignment.refine import fit_ranges
 from fsmsm_jax.alignment.rounds import in_rounds
 from fsmsm_jax.alignment.theseus import distinct_headings, theseus
 from fsmsm_jax.sensing import Scan, raycast

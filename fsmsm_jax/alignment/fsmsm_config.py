@@ -3,7 +3,7 @@
 The thesis climbs to ν = 5 and casts about 250 virtual scans a match. Most of them buy
 what a few steps along the exact derivative of the cast give better. So the default
 stops at ν = 2, rehearses distinct headings instead of neighbours, finishes with
-`refine.fit_ranges` and casts 92. It need not be told the noise, and its mean errors are
+`fit.fit_ranges` and casts 92. It need not be told the noise, and its mean errors are
 half as large without map noise and a quarter smaller with. `FsmsmConfig.published`
 climbs on, and follows the thesis's program in everything that is compared.
 """

@@ -22,9 +22,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from fsmsm_jax.alignment.caer import caer_per_ray
+from fsmsm_jax.alignment.fit import polish_ranges
 from fsmsm_jax.alignment.fsmsm import fsmsm
 from fsmsm_jax.alignment.fsmsm_config import FsmsmConfig
-from fsmsm_jax.alignment.refine import covariance, polish_ranges
+from fsmsm_jax.alignment.information import covariance
 from fsmsm_jax.sensing import Scan, panorama, raycast
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 

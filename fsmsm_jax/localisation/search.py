@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fsmsm_jax import geometry
-from fsmsm_jax.alignment.refine import covariance, descend_end_points, polish_ranges
+from fsmsm_jax.alignment.fit import descend_end_points, polish_ranges
+from fsmsm_jax.alignment.information import covariance
 from fsmsm_jax.localisation.atlas import ScanAtlas, range_phases
 from fsmsm_jax.localisation.correlative import rank_poses
 from fsmsm_jax.localisation.judge import Evidence, explain, trust

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fsmsm_jax.alignment.refine import fit_ranges
+from fsmsm_jax.alignment.fit import fit_ranges
 from fsmsm_jax.evaluation.cases import as_worlds
 from fsmsm_jax.evaluation.metrics import cramer_rao_bound, pose_errors
 from fsmsm_jax.sensing import Scan, raycast

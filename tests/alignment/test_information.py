@@ -7,7 +7,8 @@ import pytest
 from scipy import ndimage
 
 from fsmsm_jax import geometry
-from fsmsm_jax.alignment.refine import covariance, descend_end_points, polish_ranges
+from fsmsm_jax.alignment.fit import descend_end_points, polish_ranges
+from fsmsm_jax.alignment.information import covariance
 from fsmsm_jax.sensing import Lidar, Scan, raycast
 from fsmsm_jax.world import OccupancyGrid, PolygonMap, buildings
 from tests.oracles.localisation import range_jacobian
