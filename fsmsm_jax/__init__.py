@@ -11,6 +11,8 @@ A tour of the house, in the order in which data passes through it:
 - `alignment`: one scan against another. Orientation by circular correlation, position
   by the first harmonic, `caer` for how alike two scans are, and descent on exact
   derivatives. `match` puts them together: a scan, a map, and about where.
+- `calibration`: what all scans have in common and nobody has measured: where the lidar
+  sits in the robot, the map's metre and place, bias, scale and noise of the ranges.
 - `localisation`: where am I. `build_atlas` scans a map once; `localise` finds one
   scan in it, `localise_batch` many.
 - `evaluation`, `io`, `plotting` and the `fsmsm` command line stand at the edge.
@@ -34,12 +36,14 @@ from fsmsm_jax.sensing import (
     raycast as raycast,
 )
 from fsmsm_jax.alignment import (
+    FastConfig as FastConfig,
     FsmsmConfig as FsmsmConfig,
     Match as Match,
     caer_at,
     match as match,
     match_batch as match_batch,
 )
+from fsmsm_jax import calibration as calibration
 from fsmsm_jax.localisation import (
     AtlasConfig as AtlasConfig,
     Localisation as Localisation,

@@ -14,6 +14,7 @@ FLOORS = {
     "world": 1,
     "sensing": 2,
     "alignment": 3,
+    "calibration": 4,
     "localisation": 4,
     "slam": 4,
     "evaluation": 5,

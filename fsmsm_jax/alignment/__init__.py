@@ -29,17 +29,30 @@ from fsmsm_jax.alignment.position import (
     position_correction as position_correction,
     translate as translate,
 )
+from fsmsm_jax.alignment.kernels import (
+    Absolute as Absolute,
+    BeamModel as BeamModel,
+    GemanMcClure as GemanMcClure,
+    Kernel as Kernel,
+    PseudoHuber as PseudoHuber,
+    Truncated as Truncated,
+)
 from fsmsm_jax.alignment.caer import (
     caer as caer,
     caer_at as caer_at,
     caer_per_ray as caer_per_ray,
     truncated_caer_per_ray as truncated_caer_per_ray,
 )
+from fsmsm_jax.alignment.refine import Refined as Refined, refine as refine
 from fsmsm_jax.alignment.fsmsm_config import (
     Alignment as Alignment,
     FsmsmConfig as FsmsmConfig,
 )
 from fsmsm_jax.alignment.fsmsm import fsmsm as fsmsm
+from fsmsm_jax.alignment.fast import (
+    FastConfig as FastConfig,
+    fast_match as fast_match,
+)
 from fsmsm_jax.alignment.match import (
     Match as Match,
     match as match,

@@ -6,12 +6,15 @@ descends. It is a sum of metres over the valid rays; thresholds are stated per r
 that they mean the same for 360 rays and for 1 081.
 
 One person in the room adds metres to a handful of rays. `truncated_caer_per_ray` lets
-no ray count for more than `limit`: a ray is right or wrong, not very wrong.
+no ray count for more than `limit`: a ray is right or wrong, not very wrong. Other
+forms, smooth, robust or aware of the sensor, charge a ray by another kernel than |e|
+(see `kernels`).
 """
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from fsmsm_jax.alignment.kernels import Absolute, Kernel
 from fsmsm_jax.sensing import Scan, raycast
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
@@ -22,6 +25,7 @@ def caer(
     ranges: Float[Array, "rays"],
     virtual: Float[Array, "rays"],
     mask: Bool[Array, "rays"] | None = None,
+    kernel: Kernel = Absolute(),
 ) -> Float[Array, ""]:
     r"""Cumulative absolute error, $\sum_n |S_R[n] - S_V[n]|$ [m] (thesis eq. 6.32).
 
@@ -29,13 +33,14 @@ def caer(
         ranges: real scan [m].
         virtual: virtual scan [m], same rays.
         mask: the rays that count; all of them if left out.
+        kernel: what a ray costs, instead of |S_R − S_V|.
 
     Example:
         >>> real, virtual = jnp.array([1.0, 2.0, 9.0]), jnp.array([1.5, 2.0, 3.0])
         >>> float(caer(real, virtual)), float(caer(real, virtual, real < 5))
         (6.5, 0.5)
     """
-    return jnp.sum(jnp.abs(ranges - virtual), where=mask)
+    return jnp.sum(kernel.cost(ranges - virtual), where=mask)
 
 
 def caer_per_ray(
@@ -71,7 +76,10 @@ def truncated_caer_per_ray(
 
 
 def caer_at(
-    world: OccupancyGrid | PolygonMap, scan: Scan, pose: Float[Array, "3"]
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    kernel: Kernel = Absolute(),
 ) -> Float[Array, ""]:
     """CAER [m] of a scan against what the world looks like from a pose.
 
@@ -83,6 +91,9 @@ def caer_at(
         world: an `OccupancyGrid` or a `PolygonMap`.
         scan: real scan, any field of view; invalid rays count nothing.
         pose: [x, y, θ] of the sensor in the map frame [m, m, rad].
+        kernel: what a ray costs: `Absolute` for CAER itself, `PseudoHuber` for a
+            smooth minimum, `GemanMcClure` or `Truncated` where some rays are wrong,
+            `BeamModel` where people shorten them.
 
     Example:
         >>> room = PolygonMap.from_outlines([[1, 1], [5, 1], [5, 4], [1, 4]])
@@ -91,9 +102,9 @@ def caer_at(
         28.0
 
     Note:
-        Differentiable in `pose` by the exact derivative of `raycast`; the gradient is
-        finite everywhere, 0 for rays that agree, and blind to walls that come into
-        view behind others.
+        Differentiable in `pose` by the exact derivative of `raycast`, forward and
+        reverse; the gradient is finite everywhere, 0 for rays that agree, and blind to
+        walls that come into view behind others.
     """
     virtual = raycast(world, pose, scan.bearings, scan.range_max)
-    return caer(scan.ranges, virtual, scan.valid)
+    return caer(scan.ranges, virtual, scan.valid, kernel)

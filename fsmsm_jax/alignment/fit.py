@@ -17,7 +17,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, ScalarLike
 
 from fsmsm_jax import geometry
 from fsmsm_jax.alignment.residuals import (
@@ -107,8 +107,8 @@ def fit_ranges(
     scan: Scan,
     pose: Float[Array, "3"],
     steps: int,
-    reach: float | Float[Array, ""] = math.inf,
-) -> Float[Array, "3"]:
+    reach: ScalarLike = math.inf,
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     r"""Robust Gauss-Newton on real minus virtual ranges, all noise unknown.
 
     Two things spoil a residual e. The sensor's noise is the same for every ray and
@@ -127,6 +127,10 @@ def fit_ranges(
         steps: how often to linearise; static.
         reach: how far from the guess the answer may lie [m], in x and in y. Along a
             narrow gap, walls drawn too close would let the pose slide without end.
+
+    Returns:
+        The pose of the lidar in the map, and the thickness of the drawn walls [m],
+        nought on polygons.
     """
     drawn_thick = isinstance(world, OccupancyGrid)
 
@@ -144,7 +148,8 @@ def fit_ranges(
         near = jnp.clip(after[:2], pose[:2] - reach, pose[:2] + reach)
         return after.at[:2].set(near), None
 
-    return jax.lax.scan(step, jnp.append(pose, 0.0), length=steps)[0][:3]
+    state = jax.lax.scan(step, jnp.append(pose, 0.0), length=steps)[0]
+    return state[:3], state[3]
 
 
 def _shared_variance(e, J, known):

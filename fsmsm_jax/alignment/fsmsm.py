@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, ScalarLike
 
 from fsmsm_jax import geometry
 from fsmsm_jax.alignment.caer import caer_per_ray
+from fsmsm_jax.alignment.first_estimate import one_world, strayed
 from fsmsm_jax.alignment.fit import fit_ranges
 from fsmsm_jax.alignment.fsmsm_config import Alignment, FsmsmConfig
 from fsmsm_jax.alignment.position import translate
@@ -104,7 +105,7 @@ def fsmsm(
         (it is a batch). `match` is the entry for a scan of any field of view.
     """
     key = jax.random.key(0) if key is None else key
-    shared = worlds if _one_world(worlds) else None
+    shared = worlds if one_world(worlds) else None
     common = dict(config=config, shared=shared, range_max=range_max)
     stages = [
         partial(_outer_step, index, **common) for index in range(len(config.levels))
@@ -123,13 +124,6 @@ def fsmsm(
         state.scans,
         state.recoveries,
     )
-
-
-def _one_world(worlds):
-    """Whether the pytree is a single map, and not many along a leading axis."""
-    if isinstance(worlds, PolygonMap):
-        return worlds.start.ndim == 2
-    return worlds.cells.ndim == 2
 
 
 def _begin(config, pose, key):
@@ -190,7 +184,7 @@ def _outer_step(index, state, job, *, config, shared, range_max):
     climb = at_rest | (state.counter > config.max_steps)
     sure = climb & ~state.geared_up & (similarity[best] > _SURE)
 
-    lost = jnp.isinf(costs[best]) | ~moved.stayed | _strayed(config, pose, job.start)
+    lost = jnp.isinf(costs[best]) | ~moved.stayed | strayed(config, pose, job.start)
     if index == top:
         lost |= caer > config.caer_limit
 
@@ -251,9 +245,9 @@ def _finish(state, job, *, config, shared, range_max):
     limit = jnp.asarray(range_max, state.pose.dtype)
     valid = jnp.ones(job.ranges.shape, bool) if job.mask is None else job.mask
     scan = Scan(job.ranges, bearings, valid, valid & (job.ranges < limit), limit)
-    fitted = fit_ranges(world, scan, state.pose, config.finish, config.box[0])
+    fitted, _ = fit_ranges(world, scan, state.pose, config.finish, config.box[0])
     # What left the box slid along walls too close together: no measurement held it.
-    held = ~_strayed(config, fitted, job.start) & world.contains(fitted[:2])
+    held = ~strayed(config, fitted, job.start) & world.contains(fitted[:2])
     pose = jnp.where(held, fitted, state.pose)
     virtual = raycast(world, pose, bearings, limit)
     return state._replace(
@@ -262,14 +256,6 @@ def _finish(state, job, *, config, shared, range_max):
         stage=state.stage + 1,
         scans=state.scans + config.finish + 1,
     )
-
-
-def _strayed(config, pose, start):
-    """Whether a pose lies too many boxes away from the first estimate, or nowhere."""
-    away = jnp.abs(pose - start)
-    turn = jnp.abs(geometry.wrap(away[2]))
-    near = jnp.all(away[:2] <= config.stray * config.box[0])
-    return ~(near & (turn <= config.stray * config.box[1]))
 
 
 def _recover_if(lost, state, job, config, world):

@@ -1,16 +1,17 @@
 """From about here to here: a scan of any field of view, a map, and a first estimate.
 
-`fsmsm` wants N rays over the full circle. `match` takes the scan as the sensor gave it:
+The engines want N rays over the full circle. `match` takes the scan as the sensor gave:
 
 1. **panorama**: N equiangular rays, and a mask of those that the sensor knows;
-2. **fsmsm**: turns and steps from the estimate to the pose;
+2. **engine**: `fast_match`, ten virtual scans, or `fsmsm`, the thesis's method, turns
+   and steps from the estimate to the pose; the type of the config says which;
 3. **guard**: the pose must explain the scan, most rays of it, and no worse than the
    estimate did; else the estimate is given back;
 4. **covariance**: what the scan's own rays, all of them, say about the pose.
 
 Odometry, a person's click on the map or `localise` may give the estimate; the truth
-should lie within the box of `FsmsmConfig.box` around it. A ray without echo is
-information all the same: both worlds, the real and the virtual, end at `range_max`.
+should lie within the config's `box` around it. A ray without echo is information all
+the same: both worlds, the real and the virtual, end at `range_max`.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from fsmsm_jax.alignment.caer import caer_per_ray
+from fsmsm_jax.alignment.fast import FastConfig, fast_match
+from fsmsm_jax.alignment.first_estimate import (
+    checked,
+    into_the_open,
+    one_world,
+    strayed,
+)
 from fsmsm_jax.alignment.fit import polish_ranges
 from fsmsm_jax.alignment.fsmsm import fsmsm
 from fsmsm_jax.alignment.fsmsm_config import FsmsmConfig
@@ -31,11 +39,9 @@ from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
 __all__ = ["Match", "match", "match_batch"]
 
-_FEWEST_RAYS = 8  # of a panorama: a heading and a first harmonic need some
-_FEWEST_ECHOES = 10  # three numbers are wanted, and some rays hit what is not drawn
 _AGREEING, _MOST = 0.3, 0.5  # [m] a ray may be off; share of the rays that are not
-_TOGETHER = 16  # scans whose covariances are computed at once
-_SIDE = 11  # positions tried along a side of the box, to find one in the open
+_TOGETHER = 64  # scans at once: enough to fill vectors, few enough for the cache
+_CAN_MASK = "fourier_mellin"  # the method of FSMSM that can do without some rays
 _KERNEL = 0.3  # [m] of the polish that finds the walls' thickness, as in `localise`
 
 
@@ -56,16 +62,16 @@ class Match(NamedTuple):
     """Whether anything was learned: a pose in the open, near the estimate, agrees with
     most rays. If not, `pose` is the estimate and `covariance` the box's."""
     iterations: Int[Array, "*batch"]
-    """Outer steps taken, those of fresh starts included."""
+    """Steps taken from pose to pose, those of fresh starts included."""
     scans: Int[Array, "*batch"]
-    """Virtual scans cast."""
+    """Virtual scans cast to find the pose."""
 
 
 def match(
     world: OccupancyGrid | PolygonMap,
     scan: Scan,
     pose: Sequence | np.ndarray | Array,
-    config: FsmsmConfig = FsmsmConfig(),
+    config: FastConfig | FsmsmConfig = FastConfig(),
     *,
     rays: int = 360,
     key: PRNGKeyArray | None = None,
@@ -77,9 +83,10 @@ def match(
         scan: one real scan, of any field of view and number of rays.
         pose: estimate [x, y, θ] of the sensor in the map frame [m, m, rad]. One that
             lies in a wall starts from the nearest place beside it.
-        config: settings; `FsmsmConfig.published()` for the thesis's.
+        config: settings, and with them the method: `FastConfig()`, `FsmsmConfig()`, or
+            `FsmsmConfig.published()` for the thesis's.
         rays: how many rays the panorama has; about as many as the sensor's per turn.
-        key: for fresh starts from the box around the estimate.
+        key: for FSMSM's fresh starts from the box around the estimate.
 
     Returns:
         The pose and what to think of it; arrays on the device. Where every attempt
@@ -111,7 +118,7 @@ def match(
             f"expected a scan with (rays,) ranges, got shape {np.shape(scan.ranges)}; "
             "match takes one scan, match_batch many"
         )
-    if not _one_world(world):
+    if not one_world(world):
         raise ValueError("expected one map, got many; match_batch takes those")
     if np.shape(pose) != (3,):
         raise ValueError(
@@ -127,7 +134,7 @@ def match_batch(
     worlds: OccupancyGrid | PolygonMap,
     scans: Scan,
     poses: Sequence | np.ndarray | Array,
-    config: FsmsmConfig = FsmsmConfig(),
+    config: FastConfig | FsmsmConfig = FastConfig(),
     *,
     rays: int = 360,
     key: PRNGKeyArray | None = None,
@@ -150,113 +157,57 @@ def match_batch(
         ValueError: as `match`, for any of the scans; the number of scans, poses and
             maps differs; the scans differ in `range_max`.
     """
-    poses = _check(worlds, scans, poses, rays)
-    starts, open_space = _into_the_open(worlds, poses, config.box)
-    if not np.all(open_space):
-        n = int(np.argmin(open_space))
-        raise ValueError(
-            f"pose {n}, {np.asarray(poses[n]).tolist()}, is off the map or inside a "
-            f"wall, and so is all within {np.asarray(config.box[0]):g} m of it; is it "
-            "the sensor's pose in the map frame, in metres and radians?"
-        )
+    poses = checked(worlds, scans, poses, rays)
+    starts = into_the_open(worlds, poses, config.box)
     panoramas = _panoramas(scans, rays)
-    mask = panoramas.valid  # full or not: one program for both
-    if config.orientation != "fourier_mellin":
-        missing = int(np.max(np.sum(~np.asarray(mask), axis=-1)))
+    if isinstance(config, FsmsmConfig) and config.orientation != _CAN_MASK:
+        missing = int(np.max(np.sum(~np.asarray(panoramas.valid), axis=-1)))
         if missing:
             raise ValueError(
                 f"{config.orientation!r} needs every ray, but {missing} of {rays} are "
-                "missing; orientation='fourier_mellin' can do without them"
+                f"missing; orientation={_CAN_MASK!r} can do without them"
             )
-        mask = None
     key = jax.random.key(0) if key is None else key
-    return _match(worlds, scans, panoramas.ranges, mask, poses, starts, config, key)
-
-
-def _one_world(world):
-    """Whether the pytree is a single map, and not many along a leading axis."""
-    single = {OccupancyGrid: "cells", PolygonMap: "start"}[type(world)]
-    return np.ndim(getattr(world, single)) == 2
-
-
-def _check(worlds, scans, poses, rays):
-    """The poses as an array, if all inputs are sound."""
-    if np.ndim(scans.ranges) != 2:
-        raise ValueError(
-            f"expected scans with (scans, rays) ranges, got {np.shape(scans.ranges)}; "
-            "match_batch takes many scans, match one"
-        )
-    if rays < _FEWEST_RAYS:
-        raise ValueError(
-            f"a panorama needs at least {_FEWEST_RAYS} rays to match, got {rays}"
-        )
-    count = len(scans.ranges)
-    poses = np.array(poses, float)
-    if poses.shape != (count, 3) or count == 0:
-        raise ValueError(
-            f"expected one pose [x, y, θ] a scan, shape ({count}, 3) for {count} "
-            f"scans, got {poses.shape}"
-        )
-    if not np.isfinite(poses).all():
-        n = int(np.argmin(np.isfinite(poses).all(axis=1)))
-        raise ValueError(
-            f"pose {n} is {poses[n].tolist()}; a match starts from finite numbers. "
-            "Without an estimate, `localise` finds one"
-        )
-    if not _one_world(worlds):
-        maps = len(jax.tree.leaves(worlds)[0])
-        if maps != count:
-            raise ValueError(f"expected one map or one a scan ({count}), got {maps}")
-    limits = np.asarray(scans.range_max)
-    if np.ptp(limits) > 0:
-        raise ValueError(
-            f"the scans of a batch share one range_max, got {limits.min():g} to "
-            f"{limits.max():g} m; match each sensor's scans apart"
-        )
-    echoes = np.sum(np.asarray(scans.echo), axis=-1)
-    if np.min(echoes) < _FEWEST_ECHOES:
-        raise ValueError(
-            f"scan {int(np.argmin(echoes))} has {np.min(echoes)} echoes, but it takes "
-            f"at least {_FEWEST_ECHOES} to say where they are seen from; check "
-            "range_max and units"
-        )
-    poses[:, 2] = np.mod(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
-    return jnp.asarray(poses, scans.ranges.dtype)
-
-
-@jax.jit
-def _into_the_open(worlds, poses, box):
-    """Of the places in the box, the nearest in the open; and whether there is any."""
-    x, y = np.meshgrid(*[np.linspace(-1, 1, _SIDE)] * 2)
-    shifts = np.stack([x.ravel(), y.ravel()], axis=-1)
-    shifts = shifts[np.argsort(np.hypot(*shifts.T), kind="stable")]
-    shifts = box[0] * jnp.asarray(shifts, poses.dtype)
-
-    def one(world, pose):
-        inside = world.contains(pose[None, :2] + shifts)
-        nearest = shifts[jnp.argmax(inside)]
-        return pose.at[:2].add(nearest), jnp.any(inside)
-
-    shared = None if _one_world(worlds) else 0
-    return jax.vmap(one, (shared, 0))(worlds, poses)
+    return _match(worlds, scans, panoramas, poses, starts, config, key)
 
 
 _panoramas = jax.jit(jax.vmap(panorama, (0, None)), static_argnums=1)
 
 
 @jax.jit
-def _match(worlds, scans, ranges, mask, poses, starts, config, key):
-    limit = scans.range_max[0]
-    found = fsmsm(worlds, ranges, starts, config, mask=mask, range_max=limit, key=key)
-    shared = worlds if _one_world(worlds) else None
+def _match(worlds, scans, panoramas, poses, starts, config, key):
+    shared = worlds if one_world(worlds) else None
+    own = worlds if shared is None else None
+    found = None
+    if isinstance(config, FsmsmConfig):
+        found = fsmsm(
+            worlds,
+            panoramas.ranges,
+            starts,
+            config,
+            # Full or not: one program for both. Some methods know no masks.
+            mask=panoramas.valid if config.orientation == _CAN_MASK else None,
+            range_max=scans.range_max[0],
+            key=key,
+        )
 
-    def judge(job):
-        world, scan, given, pose, converged = job
+    def one(job):
+        world, scan, panorama, given, start, found = job
         world = world if shared is None else shared
-        before, agreed = _compare(world, scan, given)
-        caer, agreement = _compare(world, scan, pose)
-        learned = converged & (caer <= before) & (agreement >= _MOST)
-        spread = covariance(world, scan, pose, _thickness(world, scan, pose))
+        if isinstance(config, FastConfig):
+            pose, thickness = fast_match(world, scan, panorama, start, config)
+            learned = world.contains(pose[:2]) & ~strayed(config, pose, given)
+            steps, scans = 1 + config.looks + config.finish, config.scans
+        else:
+            pose, learned = found.pose, found.converged
+            thickness = _thickness(world, scan, pose)
+            steps, scans = found.steps, found.scans
+        compare = lambda pose: _compare(world, scan, pose)
+        (before, caer), (agreed, agreement) = jax.vmap(compare)(
+            jnp.stack([given, pose])
+        )
+        learned &= (caer <= before) & (agreement >= _MOST)
+        spread = covariance(world, scan, pose, thickness)
         half = jnp.stack([config.box[0], *config.box]).astype(pose.dtype)
         return Match(
             pose=jnp.where(learned, pose, given),
@@ -265,14 +216,22 @@ def _match(worlds, scans, ranges, mask, poses, starts, config, key):
             caer_before=before,
             agreement=jnp.where(learned, agreement, agreed),
             converged=learned,
-            iterations=jnp.zeros((), int),
-            scans=jnp.zeros((), int),
+            iterations=jnp.asarray(steps, int),
+            scans=jnp.asarray(scans, int),
         )
 
-    own = worlds if shared is None else None
-    jobs = (own, scans, poses, found.pose, found.converged)
-    judged = jax.lax.map(judge, jobs, batch_size=_TOGETHER)
-    return judged._replace(iterations=found.steps, scans=found.scans)
+    jobs = (own, scans, panoramas, poses, starts, found)
+    return _in_blocks(one, jobs, len(poses))
+
+
+def _in_blocks(one, jobs, count):
+    """Some at a time. The last block is filled up: it need not be compiled apart."""
+    if count <= _TOGETHER:
+        return jax.vmap(one)(jobs)
+    index = jnp.minimum(jnp.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1)
+    filled = jax.tree.map(lambda a: a[index], jobs)
+    done = jax.lax.map(one, filled, batch_size=_TOGETHER)
+    return jax.tree.map(lambda a: a[:count], done)
 
 
 def _thickness(world, scan, pose):

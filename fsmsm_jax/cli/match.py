@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float
 
+from fsmsm_jax.alignment.fast import FastConfig
 from fsmsm_jax.alignment.fsmsm_config import FsmsmConfig
 from fsmsm_jax.alignment.match import Match, match as match_scan
 from fsmsm_jax.cli.console import area, pose_in_words, save_picture, summary, timed
@@ -55,7 +56,7 @@ def match(
     scan = read_scans(log, topic).scan(index)
     x, y, degrees = initial
     start = jnp.array([x, y, np.deg2rad(degrees)])
-    config = FsmsmConfig()
+    config = FastConfig()
     if published is not None:
         config = FsmsmConfig.published(sigma_range=published)
     once = lambda: match_scan(world, scan, start, config, rays=rays)

@@ -3,6 +3,7 @@
 The published experiments, in the order in which data passes through them: worlds out
 of scans (`environments`), questions with their noise (`cases`), numbers with their
 uncertainty (`estimates`), whole matchers (`experiments`) and their parts (`stages`).
+And from how far off a matcher finds home (`basins`).
 """
 
 from fsmsm_jax.evaluation.metrics import (
@@ -48,3 +49,4 @@ from fsmsm_jax.evaluation.stages import (
     rotation_row as rotation_row,
     translation_walk as translation_walk,
 )
+from fsmsm_jax.evaluation.basins import Basin as Basin, basin as basin

@@ -1,7 +1,8 @@
 """Pictures: each function draws one thing on an Axes that you bring, and returns it.
 
 `localisation` shows one answer on its map; `thesis` shows what many answers are worth:
-the figures of the published evaluation, with the published numbers on them.
+the figures of the published evaluation, with the published numbers on them; `basins`
+from how far off a matcher still finds home.
 
 Import this package by its name; `import fsmsm_jax` alone does not load matplotlib.
 """
@@ -27,3 +28,4 @@ from fsmsm_jax.plotting.thesis import (
     plot_similarity as plot_similarity,
     plot_sweep as plot_sweep,
 )
+from fsmsm_jax.plotting.basins import plot_basin as plot_basin

@@ -2,4 +2,7 @@
 
 from fsmsm_jax.sensing.lidar import Lidar as Lidar, Scan as Scan
 from fsmsm_jax.sensing.panorama import panorama as panorama
-from fsmsm_jax.sensing.raycast import raycast as raycast
+from fsmsm_jax.sensing.raycast import (
+    raycast as raycast,
+    raycast_with_jacobian as raycast_with_jacobian,
+)

@@ -9,8 +9,8 @@ in the map.
 
 Three fields are computed once, on the host, when a grid is made:
 `clearance` (how many cells a ray may safely jump), `distance` (metres to the
-nearest occupied cell: end points of a scan should find it small) and `surface`
-(blurred occupancy, whose gradient is the wall's normal).
+nearest occupied cell: end points of a scan should find it small) and `slope`
+(gradient of the blurred occupancy, along the wall's normal).
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from fsmsm_jax import geometry
 __all__ = ["OccupancyGrid"]
 
 _OCCUPIED_PERCENT = 50
-_SURFACE_BLUR = 1.5  # [cells]: wide enough that stair-steps of a slanted wall vanish
+_BLUR = 1.5  # [cells]: wide enough that stair-steps of a slanted wall vanish
 
 
 class OccupancyGrid(eqx.Module):
@@ -45,8 +45,9 @@ class OccupancyGrid(eqx.Module):
     """
     distance: Float[Array, "height width"]
     """Distance from the cell's centre to the nearest occupied cell's centre [m]."""
-    surface: Float[Array, "height width"]
-    """Blurred occupancy in [0, 1]; its downhill direction is the wall's normal."""
+    slope: Float[Array, "height width 2"]
+    """Gradient of the blurred occupancy along columns and rows, in the grid's frame;
+    downhill is the wall's normal."""
 
     @classmethod
     def from_cells(
@@ -105,14 +106,16 @@ class OccupancyGrid(eqx.Module):
             )
         else:
             distance = np.full(cells.shape, np.hypot(*cells.shape) * resolution)
-        surface = ndimage.gaussian_filter(occupied.astype(np.float32), _SURFACE_BLUR)
+        blurred = ndimage.gaussian_filter(occupied.astype(np.float32), _BLUR)
+        along = [ndimage.correlate1d(blurred, [-1, 0, 1], axis) for axis in (1, 0)]
+        slope = np.stack(along, axis=-1)
         return cls(
             cells=jnp.asarray(cells, jnp.int8),
             resolution=jnp.asarray(resolution, float),
             origin=jnp.asarray(origin, float),
             clearance=jnp.asarray(np.minimum(np.asarray(clearance), 255), jnp.uint8),
             distance=jnp.asarray(distance, float),
-            surface=jnp.asarray(surface, float),
+            slope=jnp.asarray(slope, float),
         )
 
     @property

@@ -25,7 +25,7 @@ def scan_of(ranges, valid=None):
 
 @partial(jax.jit, static_argnames="steps")
 def fit(worlds, ranges, starts, steps=8, reach=np.inf):
-    one = lambda world, r, start: fit_ranges(world, scan_of(r), start, steps, reach)
+    one = lambda world, r, start: fit_ranges(world, scan_of(r), start, steps, reach)[0]
     return jax.vmap(one)(worlds, ranges, starts)
 
 
@@ -116,8 +116,8 @@ def test_reach_holds_the_pose_in_a_gap_that_got_narrower():
     true = jnp.asarray([*CENTRE, 0.7], float)
     ranges = raycast(PolygonMap.from_outlines(wedge), true, BEARINGS, FAR)
     world = PolygonMap.from_outlines(drawn)
-    free = fit_ranges(world, scan_of(ranges), true, 8)
-    held = fit_ranges(world, scan_of(ranges), true, 8, 0.05)
+    free, _ = fit_ranges(world, scan_of(ranges), true, 8)
+    held, _ = fit_ranges(world, scan_of(ranges), true, 8, 0.05)
     assert abs(float(free[0] - true[0])) > 0.1  # what the reach is for
     assert jnp.max(jnp.abs((held - true)[:2])) <= 0.05 + 1e-5
 
@@ -126,5 +126,5 @@ def test_no_rays_no_nan():
     start = jnp.asarray([*CENTRE, 0.4], float)
     nothing = scan_of(jnp.full(RAYS, 5.0), jnp.zeros(RAYS, bool))
     np.testing.assert_allclose(
-        fit_ranges(l_room(), nothing, start, 3), start, atol=1e-6
+        fit_ranges(l_room(), nothing, start, 3)[0], start, atol=1e-6
     )

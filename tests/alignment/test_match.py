@@ -10,7 +10,13 @@ from hypothesis import example, given, settings, strategies as st
 
 import fsmsm_jax as fj
 from fsmsm_jax import geometry
-from fsmsm_jax.alignment import FsmsmConfig, fsmsm, match, match_batch
+from fsmsm_jax.alignment import (
+    FastConfig,
+    FsmsmConfig,
+    fast_match,
+    match,
+    match_batch,
+)
 from fsmsm_jax.evaluation.metrics import pose_errors
 from fsmsm_jax.io.logs import read_scans
 from fsmsm_jax.sensing import Lidar, Scan, raycast
@@ -69,7 +75,7 @@ def office():
 
 
 @pytest.mark.parametrize(
-    ("degrees", "turn", "floor"), [(360, 45, 0.95), (270, 45, 0.8), (180, 20, 0.7)]
+    ("degrees", "turn", "floor"), [(360, 45, 0.95), (270, 45, 0.9), (180, 45, 0.85)]
 )
 def test_finds_the_pose_in_a_building(office, degrees, turn, floor):
     world, truth = office
@@ -163,17 +169,17 @@ def test_other_numbers_do_not_compile_again(monkeypatch):
 
     def counted(*args, **options):
         traces.append(args)
-        return fsmsm(*args, **options)
+        return fast_match(*args, **options)
 
     module = sys.modules["fsmsm_jax.alignment.match"]
-    monkeypatch.setattr(module, "fsmsm", counted)
+    monkeypatch.setattr(module, "fast_match", counted)
     match_room()
     traces.clear()
-    other = FsmsmConfig(gate=0.3, box=(0.25, 0.6), stray=1.5, caer_limit=0.2)
-    match_room(config=other, pose=NEAR + 0.01, key=jax.random.key(5))
+    other = FastConfig(apart=0.1, box=(0.25, 0.6), stray=1.5, cap=0.4)
+    match_room(config=other, pose=NEAR + 0.01)
     match_room(PolygonMap(ROOM.start * 1.01, ROOM.end * 1.01))
     assert not traces
-    match_room(config=FsmsmConfig(levels=(0,), translations=(1,), finish=0))
+    match_room(config=FastConfig(finish=2))
     assert len(traces) == 1
 
 
@@ -275,7 +281,7 @@ def test_dirt_ends_in_words_or_in_finite_numbers(scan, pose):
     for number in found:
         assert np.isfinite(np.asarray(number, float)).all()
     assert -np.pi <= found.pose[2] < np.pi
-    reach = 1.4 * 0.2  # the box and what may be strayed
+    reach = 1.31 * 0.2  # the box and what may be strayed
     inside = (np.abs(np.asarray(found.pose)[:2] - np.asarray(pose)[:2]) < reach).all()
     assert inside or not found.converged
     assert bool(ROOM.contains(found.pose[:2])) or not found.converged
@@ -284,9 +290,9 @@ def test_dirt_ends_in_words_or_in_finite_numbers(scan, pose):
 @pytest.mark.parametrize(
     ("name", "world", "degrees", "floor"),
     [
-        ("mac_turtlebot4_take2", "mac_1st_floor_9_23", 45, 0.85),
-        pytest.param("intel", "intel", 20, 0.65, marks=pytest.mark.slow),
-        pytest.param("freiburg-079", "freiburg-079", 20, 0.5, marks=pytest.mark.slow),
+        ("mac_turtlebot4_take2", "mac_1st_floor_9_23", 45, 0.95),
+        pytest.param("intel", "intel", 45, 0.9, marks=pytest.mark.slow),
+        pytest.param("freiburg-079", "freiburg-079", 45, 0.8, marks=pytest.mark.slow),
     ],
 )
 def test_finds_recorded_poses(data, name, world, degrees, floor):

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from fsmsm_jax import geometry
-from fsmsm_jax.evaluation import cramer_rao_bound, pose_errors, position_rms, success
+from fsmsm_jax.evaluation.metrics import (
+    cramer_rao_bound,
+    nees,
+    pose_errors,
+    position_rms,
+    success,
+)
 from fsmsm_jax.world import PolygonMap
 from tests.oracles.raycast import cast_walls
 from tests.worlds import CENTRE, l_room, rasterised_room, square_room
@@ -122,3 +128,24 @@ def test_bound_on_a_grid_is_near_the_polygons():
 def test_no_echo_is_no_information():
     covariance = bound(square_room(), range_max=0.5)
     np.testing.assert_allclose(covariance, np.diag([100.0, 100.0, np.pi**2]), rtol=1e-4)
+
+
+def test_nees_of_honest_claims_averages_three():
+    """χ² with 3 degrees of freedom: 2 000 draws leave √(6/2000) = 0.055 on the mean."""
+    rng = np.random.default_rng(0)
+    root = np.array([[0.02, 0, 0], [0.01, 0.03, 0], [0.001, -0.002, 0.004]])
+    reference = np.column_stack([rng.uniform(-20, 20, (2000, 2)), np.full(2000, 3.14)])
+    pose = reference + rng.standard_normal((2000, 3)) @ root.T
+    pose[:, 2] = (pose[:, 2] + np.pi) % (2 * np.pi) - np.pi  # some are now near −π
+    claimed = jnp.broadcast_to(jnp.asarray(root @ root.T, float), (2000, 3, 3))
+    found = nees(jnp.asarray(pose, float), jnp.asarray(reference, float), claimed)
+    assert np.mean(found) == pytest.approx(3, abs=4 * 0.055)
+    assert np.mean(np.asarray(found) < 7.815) == pytest.approx(0.95, abs=0.02)
+    half = nees(jnp.asarray(pose, float), jnp.asarray(reference, float), claimed / 4)
+    np.testing.assert_allclose(half, 4 * found, rtol=1e-3)
+
+
+def test_nees_stays_finite_where_nothing_is_known():
+    claimed = jnp.diag(jnp.array([100.0, 1e-6, 1e-6]))
+    found = nees(POSE + jnp.array([5.0, 1e-3, 0.0]), POSE, claimed)
+    assert float(found) == pytest.approx(1.25, rel=0.01)

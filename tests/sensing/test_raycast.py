@@ -445,7 +445,7 @@ def test_moving_a_grid_and_the_sensor_changes_nothing(move, which):
         origin=origin,
         clearance=grid.clearance,
         distance=grid.distance,
-        surface=grid.surface,
+        slope=grid.slope,
     )
     there = geometry.compose(move, pose)
     error = np.abs(cast(moved, there, BEARINGS) - cast(grid, pose, BEARINGS))

@@ -41,7 +41,7 @@ def test_distance_is_euclidean_between_centres():
 def test_empty_map_is_far_from_everything():
     grid = OccupancyGrid.from_cells(np.zeros((6, 8), int), 0.5, (5, -3, 1))
     np.testing.assert_allclose(grid.distance, 5.0)
-    assert grid.surface.max() == 0
+    assert abs(grid.slope).max() == 0
 
 
 def test_a_huge_empty_map_keeps_a_safe_clearance():
@@ -49,11 +49,13 @@ def test_a_huge_empty_map_keeps_a_safe_clearance():
     assert grid.clearance.max() == 255  # capped, not wrapped around uint8
 
 
-def test_surface_slopes_across_the_wall():
+def test_slopes_rise_into_the_wall():
     cells = np.zeros((20, 20), int)
     cells[:, 12:] = 100
-    surface = np.asarray(OccupancyGrid.from_cells(cells, 0.05, (5, -3, 1)).surface)
-    assert surface[10, 6] < 0.01 < 0.3 < surface[10, 11] < 0.5 < surface[10, 12]
+    slope = np.asarray(OccupancyGrid.from_cells(cells, 0.05, (5, -3, 1)).slope)
+    assert np.abs(slope[..., 1]).max() < 1e-6  # nothing changes from row to row
+    assert slope[10, 5, 0] < 0.01 < 0.3 < slope[10, 11, 0]
+    np.testing.assert_allclose(slope[10, 11, 0], slope[10, 12, 0], rtol=1e-4)
 
 
 def test_cells_and_map_frame_with_yaw():

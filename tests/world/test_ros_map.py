@@ -272,7 +272,7 @@ def test_there_and_back(tmp_path, values, origin, resolution):
     grid = OccupancyGrid.from_cells(cells, resolution, origin)
     save_map(grid, tmp_path / "saved: #1.yaml")
     again = load_map(tmp_path / "saved: #1.yaml")
-    for name in ("cells", "resolution", "origin", "clearance", "distance", "surface"):
+    for name in ("cells", "resolution", "origin", "clearance", "distance", "slope"):
         np.testing.assert_array_equal(
             getattr(again, name), getattr(grid, name), err_msg=name
         )
