@@ -42,6 +42,7 @@ from fsmsm_jax.alignment import (
     caer_at,
     match as match,
     match_batch as match_batch,
+    refine as refine,
 )
 from fsmsm_jax import calibration as calibration
 from fsmsm_jax.localisation import (

@@ -44,6 +44,20 @@ from fsmsm_jax.alignment.caer import (
     truncated_caer_per_ray as truncated_caer_per_ray,
 )
 from fsmsm_jax.alignment.refine import Refined as Refined, refine as refine
+from fsmsm_jax.alignment.fit import (
+    descend_end_points as descend_end_points,
+    fit_ranges as fit_ranges,
+    polish_ranges as polish_ranges,
+)
+from fsmsm_jax.alignment.information import (
+    Directions as Directions,
+    covariance as covariance,
+    cramer_rao_bound as cramer_rao_bound,
+    degenerate_directions as degenerate_directions,
+    fisher_information as fisher_information,
+    from_ros as from_ros,
+    to_ros as to_ros,
+)
 from fsmsm_jax.alignment.fsmsm_config import (
     Alignment as Alignment,
     FsmsmConfig as FsmsmConfig,

@@ -124,10 +124,9 @@ def match(
         raise ValueError(
             f"a pose is [x, y, θ], three numbers [m, m, rad]; got {np.shape(pose)}"
         )
-    scans = jax.tree.map(lambda a: a[None], scan)
     poses = np.asarray(pose, float)[None]
-    found = match_batch(world, scans, poses, config, rays=rays, key=key)
-    return jax.tree.map(lambda a: a[0], found)
+    found = match_batch(world, _as_batch(scan), poses, config, rays=rays, key=key)
+    return _first(found)
 
 
 def match_batch(
@@ -171,6 +170,9 @@ def match_batch(
     return _match(worlds, scans, panoramas, poses, starts, config, key)
 
 
+# Compiled, since array by array they would take as long as the match itself.
+_as_batch = jax.jit(lambda tree: jax.tree.map(lambda a: a[None], tree))
+_first = jax.jit(lambda tree: jax.tree.map(lambda a: a[0], tree))
 _panoramas = jax.jit(jax.vmap(panorama, (0, None)), static_argnums=1)
 
 

@@ -5,7 +5,7 @@ in what they make of the exact derivative of the virtual scan:
 
 - "gauss_newton" weighs the rays by their kernel and solves for the step at once;
 - "levenberg_marquardt" does so carefully: a step must lower the cost, or is shortened;
-- "lbfgs" (optax) learns the curvature from gradients and searches along each line;
+- "lbfgs" (optax) learns the curvature from gradients and compares steps along a line;
 - "adam" (optax) needs nothing but gradients, and many of them.
 
 Each runs in stages. The first has the kernel widened, so that rays far off still
@@ -40,7 +40,7 @@ METHODS = {"gauss_newton": 8, "levenberg_marquardt": 8, "lbfgs": 6, "adam": 40}
 _DAMPING = 1e-4  # of Gauss-Newton; Levenberg and Marquardt's starts at _CAREFUL
 _CAREFUL, _EASIER, _HARDER = 1e-3, 0.3, 5.0  # and its factors after good and bad steps
 _STRIDE = 0.01  # [m] first step of Adam in the last stage; wider stages stride wider
-_LINE_SEARCH = 12  # evaluations along one line
+_LENGTHS = 10  # steps compared along one line, each half as long as the one before
 _LEVERS = 0.5, 20.0  # [m] limits of the mean range as a lever arm
 _LONGEST = 0.5  # [m] a line search may go at once: gradients reach no farther
 _SETTLED = 0.01  # [m] and [rad] that one more Gauss-Newton step would go
@@ -104,10 +104,10 @@ def refine(
     Note:
         Written for one pose: `jax.vmap(refine, (None, None, 0))` refines candidates
         against one scan. A step of Gauss-Newton casts one virtual scan, one of
-        Levenberg-Marquardt too, one of Adam two, and one of L-BFGS up to 13. On grids
+        Levenberg-Marquardt too, one of Adam two, and one of L-BFGS 12. On grids
         the first two estimate the walls' thickness along with the pose (`fit_ranges`
         says why), the others do not. `fit.fit_ranges` is the sharper tool where the
-        noise is Gaussian and unknown, and no objective is asked for.
+        noise is Gaussian and unknown.
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}: choose from {', '.join(METHODS)}")
@@ -209,11 +209,8 @@ def _gauss_newton(steps):
     def step(problem, walker):
         (state,) = walker
         e, J = problem.residuals(state)
-        return (
-            (gauss_newton_step(state, e, J, problem.weights(e), _DAMPING),),
-            state,
-            e,
-        )
+        ahead = gauss_newton_step(state, e, J, problem.weights(e), _DAMPING)
+        return (ahead,), state, e
 
     return begin, step
 
@@ -261,8 +258,9 @@ def _adam(steps):
 
 def _lbfgs(steps):
     del steps
-    search = optax.scale_by_zoom_linesearch(_LINE_SEARCH, initial_guess_strategy="one")
-    optimiser = optax.lbfgs(memory_size=4, linesearch=search)
+    # optax's own line search may never end under `vmap`: all lengths at once instead.
+    optimiser = optax.scale_by_lbfgs(memory_size=4)
+    lengths = 0.5 ** jnp.arange(_LENGTHS)
 
     def begin(problem, state):
         return state, optimiser.init(state)
@@ -270,15 +268,21 @@ def _lbfgs(steps):
     def step(problem, walker):
         state, memory = walker
         unit = _metres(problem.scan)
-        mean = lambda u: (
-            problem.cost(problem.errors((u / unit)[:3])) / len(problem.scan.ranges)
-        )
-        value, slope = optax.value_and_grad_from_state(mean)(state * unit, state=memory)
-        turn, memory = optimiser.update(
-            slope, memory, state * unit, value=value, grad=slope, value_fn=mean
-        )
-        turn = jax.tree.map(lambda a: jnp.clip(a, -_LONGEST, _LONGEST), turn)
-        return (state + turn / unit, memory), state, problem.errors(state[:3])
+
+        def mean(u):
+            e = problem.errors((u / unit)[:3])
+            return problem.cost(e) / e.size, e
+
+        (value, e), slope = jax.value_and_grad(mean, has_aux=True)(state * unit)
+        turn, memory = optimiser.update(slope, memory, state * unit)
+        # Where the objective bends the wrong way, what was learned may point uphill.
+        turn = -jnp.where(jnp.sum(turn * slope) > 0, turn, slope)
+        turn = jnp.clip(turn, -_LONGEST, _LONGEST)
+        ahead = (state * unit)[None] + lengths.astype(state.dtype)[:, None] * turn[None]
+        costs = jax.vmap(lambda u: mean(u)[0])(ahead)
+        best = jnp.argmin(costs)
+        there = jnp.where(costs[best] < value, ahead[best] / unit, state)
+        return (there, memory), state, e
 
     return begin, step
 

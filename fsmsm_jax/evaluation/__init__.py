@@ -10,6 +10,7 @@ from fsmsm_jax.evaluation.metrics import (
     cramer_rao_bound as cramer_rao_bound,
     pose_errors as pose_errors,
     position_rms as position_rms,
+    nees as nees,
     success as success,
 )
 from fsmsm_jax.evaluation.environments import (
