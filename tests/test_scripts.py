@@ -46,3 +46,22 @@ def test_reproduce_thesis_quickly(tmp_path):
         "degrees",
     }
     assert all(path.stat().st_size < 200_000 for path in pictures.iterdir())
+
+
+@pytest.mark.slow
+def test_bench_accuracy_quickly(tmp_path):
+    """Sections that need recordings are left out; the others print their tables."""
+    page = tmp_path / "accuracy.md"
+    command = [sys.executable, "scripts/bench_accuracy.py", "--quick"]
+    run = subprocess.run(
+        [*command, "--markdown", str(page)],
+        cwd=ROOT,
+        env=os.environ | {"FSMSM_DATA": str(tmp_path / "no")},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    tables = page.read_text()
+    for title in ("polygon worlds", "Noise in the map, too", "occupancy grid", "Speed"):
+        assert title in tables
+    assert "real lidar" not in tables

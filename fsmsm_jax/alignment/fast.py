@@ -30,7 +30,7 @@ from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
 __all__ = ["FastConfig", "fast_match"]
 
-_LEAN = (2.0, 1.5, 1.0, 0.8, 0.6, 0.5, 0.4, 0.3)  # [m] kernel scales, without a cast
+_LEAN = (2.0, 1.0, 0.7, 0.5, 0.3)  # [m] kernel scales, without a cast
 _LOOK = (0.6, 0.4, 0.3)  # [m] the same after each cast
 _DAMPING = 1e-2  # share of the rays' weight: a corridor's length stays as estimated
 

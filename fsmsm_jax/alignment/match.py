@@ -166,32 +166,50 @@ def match_batch(
                 f"{config.orientation!r} needs every ray, but {missing} of {rays} are "
                 f"missing; orientation={_CAN_MASK!r} can do without them"
             )
-    key = jax.random.key(0) if key is None else key
-    return _match(worlds, scans, panoramas, poses, starts, config, key)
+    found = None
+    if isinstance(config, FsmsmConfig):
+        key = jax.random.key(0) if key is None else key
+        found = _by_fsmsm(worlds, scans, panoramas, starts, config, key)
+    shared = worlds if one_world(worlds) else None
+    own = None if one_world(worlds) else worlds
+    jobs = (own, scans, panoramas, poses, starts, found)
+    return _in_blocks(lambda block: _match(shared, block, config), jobs, len(poses))
 
 
 # Compiled, since array by array they would take as long as the match itself.
 _as_batch = jax.jit(lambda tree: jax.tree.map(lambda a: a[None], tree))
 _first = jax.jit(lambda tree: jax.tree.map(lambda a: a[0], tree))
+_some = jax.jit(lambda tree, index: jax.tree.map(lambda a: a[index], tree))
 _panoramas = jax.jit(jax.vmap(panorama, (0, None)), static_argnums=1)
 
 
+def _in_blocks(run, jobs, count):
+    """Some at a time. The last block is filled up: one program serves any number."""
+    if count <= _TOGETHER:
+        return run(jobs)
+    index = np.minimum(np.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1)
+    blocks = np.split(index, len(index) // _TOGETHER)
+    done = [run(_some(jobs, block)) for block in blocks]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:count], *done)
+
+
 @jax.jit
-def _match(worlds, scans, panoramas, poses, starts, config, key):
-    shared = worlds if one_world(worlds) else None
-    own = worlds if shared is None else None
-    found = None
-    if isinstance(config, FsmsmConfig):
-        found = fsmsm(
-            worlds,
-            panoramas.ranges,
-            starts,
-            config,
-            # Full or not: one program for both. Some methods know no masks.
-            mask=panoramas.valid if config.orientation == _CAN_MASK else None,
-            range_max=scans.range_max[0],
-            key=key,
-        )
+def _by_fsmsm(worlds, scans, panoramas, starts, config, key):
+    return fsmsm(
+        worlds,
+        panoramas.ranges,
+        starts,
+        config,
+        # Full or not: one program for both. Some methods know no masks.
+        mask=panoramas.valid if config.orientation == _CAN_MASK else None,
+        range_max=scans.range_max[0],
+        key=key,
+    )
+
+
+@jax.jit
+def _match(shared, jobs, config):
+    """Pose, verdict and covariance of a block of scans."""
 
     def one(job):
         world, scan, panorama, given, start, found = job
@@ -205,9 +223,8 @@ def _match(worlds, scans, panoramas, poses, starts, config, key):
             thickness = _thickness(world, scan, pose)
             steps, scans = found.steps, found.scans
         compare = lambda pose: _compare(world, scan, pose)
-        (before, caer), (agreed, agreement) = jax.vmap(compare)(
-            jnp.stack([given, pose])
-        )
+        caers, agreements = jax.vmap(compare)(jnp.stack([given, pose]))
+        (before, caer), (agreed, agreement) = caers, agreements
         learned &= (caer <= before) & (agreement >= _MOST)
         spread = covariance(world, scan, pose, thickness)
         half = jnp.stack([config.box[0], *config.box]).astype(pose.dtype)
@@ -222,18 +239,7 @@ def _match(worlds, scans, panoramas, poses, starts, config, key):
             scans=jnp.asarray(scans, int),
         )
 
-    jobs = (own, scans, panoramas, poses, starts, found)
-    return _in_blocks(one, jobs, len(poses))
-
-
-def _in_blocks(one, jobs, count):
-    """Some at a time. The last block is filled up: it need not be compiled apart."""
-    if count <= _TOGETHER:
-        return jax.vmap(one)(jobs)
-    index = jnp.minimum(jnp.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1)
-    filled = jax.tree.map(lambda a: a[index], jobs)
-    done = jax.lax.map(one, filled, batch_size=_TOGETHER)
-    return jax.tree.map(lambda a: a[:count], done)
+    return jax.vmap(one)(jobs)
 
 
 def _thickness(world, scan, pose):
