@@ -274,7 +274,8 @@ def _lbfgs(steps):
             return problem.cost(e) / e.size, e
 
         (value, e), slope = jax.value_and_grad(mean, has_aux=True)(state * unit)
-        turn, memory = optimiser.update(slope, memory, state * unit)
+        update, memory = optimiser.update(slope, memory, state * unit)
+        turn = jnp.asarray(update)
         # Where the objective bends the wrong way, what was learned may point uphill.
         turn = -jnp.where(jnp.sum(turn * slope) > 0, turn, slope)
         turn = jnp.clip(turn, -_LONGEST, _LONGEST)

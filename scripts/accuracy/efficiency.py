@@ -20,7 +20,7 @@ from fsmsm_jax.evaluation import (
 from fsmsm_jax.evaluation.cases import bearings
 from fsmsm_jax.evaluation.metrics import nees
 from fsmsm_jax.sensing import Lidar, Scan, raycast
-from fsmsm_jax.world import buildings
+from fsmsm_jax.world import OccupancyGrid, PolygonMap, buildings
 
 SIGMAS = (0.01, 0.03, 0.05, 0.10)
 WRONG = 10.0  # standard deviations of the bound: another basin than the truth's
@@ -38,7 +38,7 @@ HEAD = (
 class Questions(NamedTuple):
     """Scans with their truth and the estimates to start from."""
 
-    worlds: object
+    worlds: OccupancyGrid | PolygonMap
     """One map, or as many as there are scans."""
     scans: Scan
     initial: jax.Array
@@ -128,7 +128,12 @@ def _in_grid(floor, count, sigma):
     return Questions(floor, scans, initial, true, bound)
 
 
-def _row(name, asked, config=FastConfig(), map_is_true=True):
+def _row(
+    name: str,
+    asked: Questions,
+    config: FastConfig | FsmsmConfig = FastConfig(),
+    map_is_true: bool = True,
+) -> tuple[str, ...]:
     found, seconds = timed(asked.worlds, asked.scans, asked.initial, config)
     metres, radians = (
         np.asarray(e, float) for e in pose_errors(found.pose, asked.true)
