@@ -78,13 +78,11 @@ def refine(
     Args:
         world: the map.
         scan: the real scan, any field of view; its valid rays count.
-        pose: finite guess [x, y, θ] of the lidar in the map [m, m, rad], within some
-            decimetres and some ten degrees.
+        pose: finite guess [x, y, θ] of the lidar in the map [m, m, rad].
         method: a name in `METHODS`; static.
         kernel: what a ray costs.
         steps: steps in each stage, those of `METHODS` if left out; static.
-        widening: factor by which the kernel is widened, stage after stage; (1,) for
-            a single stage, which suffices within some centimetres.
+        widening: factor of the kernel, stage after stage; (1,) suffices within cm.
 
     Returns:
         The pose and what to think of it.
@@ -104,10 +102,9 @@ def refine(
     Note:
         Written for one pose: `jax.vmap(refine, (None, None, 0))` refines candidates
         against one scan. A step of Gauss-Newton casts one virtual scan, one of
-        Levenberg-Marquardt too, one of Adam two, and one of L-BFGS 12. On grids
-        the first two estimate the walls' thickness along with the pose (`fit_ranges`
-        says why), the others do not. `fit.fit_ranges` is the sharper tool where the
-        noise is Gaussian and unknown.
+        Levenberg-Marquardt too, one of Adam two, and one of L-BFGS 12. On grids the
+        first two estimate the walls' thickness as well (`fit_ranges` says why).
+        `fit.fit_ranges` is sharper where the noise is Gaussian and unknown.
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}: choose from {', '.join(METHODS)}")
