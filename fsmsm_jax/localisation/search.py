@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fsmsm_jax import geometry
-from fsmsm_jax.alignment.fit import descend_end_points, polish_ranges
+from fsmsm_jax.alignment.fit import descend_end_points, fit_ranges, polish_ranges
 from fsmsm_jax.alignment.information import covariance
 from fsmsm_jax.localisation.atlas import ScanAtlas, range_phases
 from fsmsm_jax.localisation.correlative import rank_poses
@@ -198,8 +198,7 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
     evidence = _judge(world, scan, poses, thickness)
     order, score = _distinct(poses, evidence.score, config.reported, 0.3, 0.25)
     poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
-    scales = jnp.full(4, 0.3)  # wide: all good rays count, as the bound asks
-    pose, thick = polish_ranges(world, scan, poses[0], scales)
+    pose, thick = fit_ranges(world, scan, poses[0], 4, 0.1)  # all good rays count
     poses = poses.at[0].set(pose)
     spread = covariance(world, scan, pose, thick)
     best = jax.tree.map(lambda a: a[0], evidence)
