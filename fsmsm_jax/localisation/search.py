@@ -5,7 +5,7 @@
 1. **rank** every lattice position at every heading by end points (`correlative`);
 2. **turn** the best to the heading that the atlas's panoramas ask for, by one masked
    circular correlation each, and rank again with its similarity;
-3. **descend** each survivor onto the walls by its end points (`refine`);
+3. **descend** each survivor onto the walls by its end points (`alignment.fit`);
 4. **judge** each by what the map explains of each ray (`judge`), drop near
    duplicates, and polish the best few by their ranges, on the exact derivative;
 5. **report** pose, covariance, CAER per ray, the runners-up, and whether the best
