@@ -19,15 +19,11 @@ Recordings are looked for at ../shared/data, or where FSMSM_DATA points; section
 need them are left out without.
 """
 
-import argparse
-import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from accuracy import consistency, efficiency, mounting, speed, wean
-from reproduce_thesis import folder
-from thesis.report import Table, circumstances
+from thesis.report import Table, find_folder, parser_of, print_sections
 from thesis.worlds import Options
 
 SECTIONS: dict[str, Callable[[Options], Iterator[Table]]] = {
@@ -42,12 +38,7 @@ SECTIONS: dict[str, Callable[[Options], Iterator[Table]]] = {
 
 
 def main() -> None:
-    summary, _, details = (__doc__ or "").partition("\n\n")
-    parser = argparse.ArgumentParser(
-        description=summary,
-        epilog=details,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of(__doc__)
     add = parser.add_argument
     add("--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="these sections")
     add("--worlds", type=int, default=1000, metavar="N", help="cases (default: 1000)")
@@ -57,19 +48,9 @@ def main() -> None:
     options = Options(
         worlds=20 if given.quick else given.worlds,
         quick=given.quick,
-        data=folder("FSMSM_DATA", "data"),
+        data=find_folder("FSMSM_DATA", "data"),
     )
-    facts = [f"{key:9} {value}" for key, value in circumstances().items()]
-    print("\n".join(facts), "\n", flush=True)
-    document = ["```", *facts, "```", ""]
-    for name in given.only or SECTIONS:
-        start = time.perf_counter()
-        for table in SECTIONS[name](options):
-            print(table.text(), flush=True)
-            document.append(table.markdown())
-        print(f"... {name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
-        if given.markdown:
-            given.markdown.write_text("\n".join(document))
+    print_sections(SECTIONS, given.only, options, given.markdown)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from thesis.report import find_folder, parser_of
 from tqdm import tqdm
 
 from fsmsm_jax.evaluation import cramer_rao_bound, pose_errors, position_rms, success
@@ -577,7 +578,7 @@ def regressions(rows: Sequence[Metric], baseline: Sequence[Metric]) -> list[str]
 
 def main() -> int:
     arguments = parse()
-    data = find_data()
+    data = find_folder("FSMSM_DATA", "data")
     names = arguments.only or (QUICK_SECTIONS if arguments.quick else tuple(SECTIONS))
     if data is None:
         left_out = [name for name in names if name != "office"]
@@ -613,21 +614,8 @@ def gate(rows: Sequence[Metric]) -> int:
     return 1 if worse else 0
 
 
-def find_data() -> Path | None:
-    folder = Path(os.environ.get("FSMSM_DATA", ROOT.parent / "shared" / "data"))
-    if folder.is_dir():
-        return folder
-    print(f"no recordings at {folder}; point FSMSM_DATA at them", file=sys.stderr)
-    return None
-
-
 def parse() -> argparse.Namespace:
-    summary, _, details = (__doc__ or "").partition("\n\n")
-    parser = argparse.ArgumentParser(
-        description=summary,
-        epilog=details,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of(__doc__)
     add = parser.add_argument
     add("--quick", action="store_true", help="office and 40 intel scans: minutes")
     add("--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="these sections")

@@ -21,14 +21,11 @@ clock's.
 """
 
 import argparse
-import os
-import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from thesis import dials, judges, main_table, program, stages
-from thesis.report import ROOT, Table, circumstances
+from thesis.report import Table, find_folder, parser_of, print_sections
 from thesis.worlds import NAMES, Options
 
 SECTIONS: dict[str, Callable[[Options], Iterator[Table]]] = {
@@ -51,39 +48,15 @@ def main() -> None:
         pairs=arguments.pairs or (QUICK_PAIRS if arguments.quick else 1_000_000),
         quick=arguments.quick,
         out=arguments.out,
-        data=folder("FSMSM_DATA", "data"),
-        golden=folder("FSMSM_GOLDEN", "golden"),
+        data=find_folder("FSMSM_DATA", "data"),
+        golden=find_folder("FSMSM_GOLDEN", "golden"),
         methods=tuple(arguments.methods),
     )
-    facts = [f"{key:9} {value}" for key, value in circumstances().items()]
-    print("\n".join(facts), "\n", flush=True)
-    document = ["```", *facts, "```", ""]
-    for name in arguments.only or SECTIONS:
-        start = time.perf_counter()
-        for table in SECTIONS[name](options):
-            print(table.text(), flush=True)
-            document.append(table.markdown())
-        print(f"... {name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
-        if arguments.markdown:  # after each section, so that no hour is lost
-            arguments.markdown.write_text("\n".join(document))
-
-
-def folder(variable: str, name: str) -> Path | None:
-    """A folder of other people's data, or None."""
-    path = Path(os.environ.get(variable, ROOT.parent / "shared" / name))
-    if path.is_dir():
-        return path
-    print(f"nothing at {path}; point {variable} at it", file=sys.stderr)
-    return None
+    print_sections(SECTIONS, arguments.only, options, arguments.markdown)
 
 
 def parse() -> argparse.Namespace:
-    summary, _, details = (__doc__ or "").partition("\n\n")
-    parser = argparse.ArgumentParser(
-        description=summary,
-        epilog=details,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of(__doc__)
     add = parser.add_argument
     add("--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="these sections")
     add(

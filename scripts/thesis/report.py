@@ -1,14 +1,15 @@
-"""Tables as text and as markdown, numbers with their intervals, and the clock's report."""
+"""What scripts that print tables have in common: sections, numbers, pictures, folders."""
 
+import argparse
 import os
 import platform
 import subprocess
 import sys
 import time
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat
 
 import jax
 from matplotlib.figure import Figure
@@ -117,3 +118,42 @@ def circumstances() -> dict[str, str]:
         "python": platform.python_version(),
         "date": time.strftime("%Y-%m-%d"),
     }
+
+
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    """A parser that says of itself what the script's docstring says."""
+    summary, _, details = (doc or "").partition("\n\n")
+    return argparse.ArgumentParser(
+        description=summary,
+        epilog=details,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def find_folder(variable: str, name: str) -> Path | None:
+    """A folder of other people's data, or None."""
+    path = Path(os.environ.get(variable, ROOT.parent / "shared" / name))
+    if path.is_dir():
+        return path
+    print(f"nothing at {path}; point {variable} at it", file=sys.stderr)
+    return None
+
+
+def print_sections(
+    sections: Mapping[str, Callable[[Any], Iterator[Table]]],
+    names: Sequence[str] | None,
+    options: Any,
+    markdown: Path | None,
+) -> None:
+    """Print these sections, or all, table by table as they are measured."""
+    facts = [f"{key:9} {value}" for key, value in circumstances().items()]
+    print("\n".join(facts), "\n", flush=True)
+    document = ["```", *facts, "```", ""]
+    for name in names or sections:
+        start = time.perf_counter()
+        for table in sections[name](options):
+            print(table.text(), flush=True)
+            document.append(table.markdown())
+        print(f"... {name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
+        if markdown:  # after each section, so that no hour is lost
+            markdown.write_text("\n".join(document))

@@ -224,8 +224,6 @@ def test_final_poses(golden, method):
     continuous, so whether one "came back" within 1e-5 rad hangs on the last digits, and
     with it the step at which a match ends. In float32 a ray at an edge does the same.
     """
-    if method == "DBH" and not golden.double:
-        pytest.skip("identical to FMT, as in float64; saves a compile")
     names = {
         "FMT": "fourier_mellin",
         "DBH": "procrustes",
