@@ -12,6 +12,7 @@ In order:
 - `speed`: milliseconds a match beside the author's C++;
 - `gl`: three big maps with cases that others were measured on;
 - `consistency`: NEES in simulation and on real scans;
+- `references`: how good the reference poses of those scans are;
 - `mounting`: a real robot's lidar, calibrated from 20° off;
 - `people`: does a kernel that expects people help where there are some?
 
@@ -22,7 +23,7 @@ need them are left out without.
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from accuracy import consistency, efficiency, mounting, speed, wean
+from accuracy import consistency, efficiency, mounting, references, speed, wean
 from thesis.report import Table, find_folder, parser_of, print_sections
 from thesis.worlds import Options
 
@@ -32,6 +33,7 @@ SECTIONS: dict[str, Callable[[Options], Iterator[Table]]] = {
     "speed": speed.speed,
     "gl": speed.gl,
     "consistency": consistency.tables,
+    "references": references.tables,
     "mounting": mounting.tables,
     "people": wean.tables,
 }

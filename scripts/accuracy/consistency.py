@@ -9,10 +9,10 @@ fit starts 3 cm and 1.7° beside it. Real scans are ones that the map was not ma
 matched from 0.2 m and 0.2 rad beside their references. Those have errors of their own.
 Against a third opinion, a fit of each scan to the scan before it:
 
-    [cm, °]         reference        our fit to the map
-    freiburg-079    1.4, 0.50        0.4, 0.15
-    intel           1.3, 0.31        1.1, 0.16
-    mac             0.4, 0.08        0.4, 0.07     (a pose, in root mean square)
+    [cm, cm, °]     reference            our fit to the map
+    freiburg-079    1.54, 1.67, 0.54     0.40, 0.41, 0.15
+    intel           1.34, 1.31, 0.30     1.17, 0.98, 0.16
+    mac             0.36, 0.57, 0.08     0.30, 0.55, 0.07     (`--only references`)
 
 So the SLAM-corrected logs are granted an uncertainty of 1 cm and 0.3° (`granted`), all
 of them the same, and the pseudo ground truth of mac, fitted to this map, none. Both
@@ -142,10 +142,8 @@ def _fits(worlds, ranges, starts):
 
 def _real(folder, name, scans):
     """Matches, their claims and the references."""
-    world, log, poses, picked, limit = _recording(folder, name, scans)
-    angles = float(log["angle_min"]), float(log["angle_increment"])
-    one = lambda n: Scan.from_ranges(log["ranges"][n], *angles, 0.02, limit)
-    batch = jax.tree.map(lambda *a: jnp.stack(a), *[one(n) for n in picked])
+    world, log, poses, picked, limit = recording(folder, name, scans)
+    batch = stacked(log, picked, limit)
     reference = poses[picked]
     off = np.random.default_rng(0).uniform(-0.2, 0.2, reference.shape)
     found = match_batch(world, batch, reference + off)
@@ -159,7 +157,14 @@ def _real(folder, name, scans):
     )
 
 
-def _recording(folder, name, scans):
+def stacked(log, picked, limit) -> Scan:
+    """These scans of a log as one pytree."""
+    angles = float(log["angle_min"]), float(log["angle_increment"])
+    one = lambda n: Scan.from_ranges(log["ranges"][n], *angles, 0.02, limit)
+    return jax.tree.map(lambda *a: jnp.stack(a), *[one(n) for n in picked])
+
+
+def recording(folder, name, scans):
     """Map, log, references, scans that the map does not know, and their reach [m]."""
     if name == "mac":
         log = np.load(folder / "mac_turtlebot4_take2.npz")
