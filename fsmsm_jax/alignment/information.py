@@ -131,7 +131,7 @@ def covariance(
     neighbours whose residuals have the same sign, and counts only if two standard
     errors above a coin's. ℓ is stated, not estimated: the pose gives way to errors that
     extend over the room, so that residuals do not show them. It was chosen on maps of
-    three buildings.
+    four buildings.
 
     Args:
         world: the map.
