@@ -1,3 +1,8 @@
 """Logs on disk become arrays; `read_scans` is the only door most people need."""
 
 from fsmsm_jax.io.logs import ScanLog as ScanLog, read_scans as read_scans
+from fsmsm_jax.io.tum import (
+    TumWriter as TumWriter,
+    read_tum as read_tum,
+    write_tum as write_tum,
+)

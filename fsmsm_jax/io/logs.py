@@ -2,30 +2,32 @@
 
 A lidar log is a list of turns, each a row of ranges. Whatever the file, the result is
 one `ScanLog` of NumPy arrays, still as dirty as the sensor was; `log.scan(i)` turns
-row i into a `Scan`, where the dirt is sorted out (see `sensing.lidar`). Poses that a
-file may carry, odometry or reference, are left alone: this is the lidar's view only,
-and a pose found from it is the pose of the *lidar*, not of the robot's base.
+row i into a `Scan`, where the dirt is sorted out (see `sensing.lidar`), and
+`log.scans()` all rows at once. Odometry, where the log has it, comes along as poses of
+the *lidar* at the time of each scan: where the lidar sits on the robot is settled here,
+once, and a pose found from a scan is the pose of the lidar, too. Reference poses that a
+file may carry are left alone.
 
-- `.npz`: `ranges` and either `bearings` or `angle_min` and `angle_increment`;
+- `.npz`: see `io.npz`;
 - CARMEN `.log`, `.log.gz`, `.clf`: see `io.carmen`;
 - ROS 1 `.bag`, ROS 2 folders, `.db3` and `.mcap`: see `io.rosbag`.
+
+Real logs are torn, out of order and full of holes. What can be read is read, and what
+was skipped or mended is counted in `ScanLog.remarks`.
 """
 
-import zipfile
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from fsmsm_jax.sensing.lidar import Scan
 
 __all__ = ["ScanLog", "read_scans"]
 
-_RANGE_MAX = 30.0  # [m] where a file states no limit, as in `Scan.from_ranges`
-_NO_ECHO_KEYS = ("range_max", "range_no_return", "no_return_above")
-_RAY_KEYS = ("ranges", "bearings", "angle_min", "angle_increment")
-_KEYS = (*_RAY_KEYS, "range_min", *_NO_ECHO_KEYS, "stamp", "stamps")
 _SUPPORTED = (
     "an .npz with ranges, angle_min and angle_increment (or bearings), a CARMEN log "
     "(.log, .clf, also .gz), a ROS 1 .bag, or a ROS 2 bag (folder, .db3 or .mcap)"
@@ -45,7 +47,15 @@ class ScanLog:
     range_max: float
     """From this range on a reading means "no echo" [m]."""
     stamps: Float[np.ndarray, "scans"] | None
-    """Recording times [s], or None where the file has none."""
+    """Recording times [s], or None where the file has none; not always increasing."""
+    odometry: Float[np.ndarray, "scans 3"] | None = None
+    """Pose of the lidar in the odometry's frame at each stamp [m, m, rad]; a row of NaN
+    where odometry is missing at that time, None where the log has none at all."""
+    ray_times: Float[np.ndarray, "scans rays"] | None = None
+    """When each ray was taken, after the scan's stamp [s]; negative where the stamp is
+    the last ray's. None if that is not known. See `reversed_sweep`."""
+    remarks: tuple[str, ...] = ()
+    """What was skipped or mended while reading, in sentences for the user."""
 
     def __len__(self) -> int:
         return len(self.ranges)
@@ -56,10 +66,7 @@ class ScanLog:
         Raises:
             ValueError: the log has no such scan, or it holds no information.
         """
-        if not -len(self) <= index < len(self):
-            raise ValueError(
-                f"the log holds scans 0 to {len(self) - 1}, there is no scan {index}"
-            )
+        self._check(np.array([index]))
         try:
             return Scan.from_bearings(
                 self.ranges[index], self.bearings[index], self.range_min, self.range_max
@@ -67,34 +74,102 @@ class ScanLog:
         except ValueError as error:
             raise ValueError(f"scan {index} of the log: {error}") from error
 
+    def scans(
+        self, indices: Int[np.ndarray, "some"] | Sequence[int] | None = None
+    ) -> Scan:
+        """Many scans along a leading axis, for `vmap` and `lax.scan`.
 
-def read_scans(path: str | Path, topic: str | None = None) -> ScanLog:
+        Rows are as `scan` gives them, but a scan without information is no error: all
+        its rays are invalid.
+
+        Args:
+            indices: which scans, counted as in `scan`; None means all.
+
+        Raises:
+            ValueError: the log has no such scan.
+        """
+        rows = np.arange(len(self)) if indices is None else np.asarray(indices)
+        self._check(rows)
+        shape = (len(rows), self.ranges.shape[1])
+        # One long scan obeys the same rules, given one ray that surely says something.
+        flat = Scan.from_bearings(
+            np.append(self.ranges[rows], self.range_max),
+            np.append(self.bearings[rows], 0.0),
+            self.range_min,
+            self.range_max,
+        )
+        unfold = lambda leaf: leaf[:-1].reshape(shape)
+        return jax.vmap(Scan, (0, 0, 0, 0, None), 0)(
+            unfold(flat.ranges),
+            unfold(flat.bearings),
+            unfold(flat.valid),
+            unfold(flat.echo),
+            flat.range_max,
+        )
+
+    def reversed_sweep(self) -> "ScanLog":
+        """The same log, the last ray of each scan being taken first.
+
+        Drivers of RPLidars, which turn clockwise, list the rays counter-clockwise and
+        leave the time from ray to ray positive. Nothing in a log tells; compensating
+        the motion in a turn with times of the wrong order makes scans twice as bad
+        (the recording mac_turtlebot4_take2 is such a log).
+
+        Raises:
+            ValueError: the log has no `ray_times`.
+        """
+        if self.ray_times is None:
+            raise ValueError("the log has no times of rays that could be reversed")
+        ends = self.ray_times.min(axis=1) + self.ray_times.max(axis=1)
+        return replace(self, ray_times=ends[:, None] - self.ray_times)
+
+    def _check(self, indices: np.ndarray) -> None:
+        wrong = indices[(indices < -len(self)) | (indices >= len(self))]
+        if wrong.size:
+            raise ValueError(
+                f"the log holds scans 0 to {len(self) - 1}, there is no scan {wrong[0]}"
+            )
+
+
+def read_scans(
+    path: str | Path, topic: str | None = None, odometry_topic: str | None = None
+) -> ScanLog:
     """All scans of a log file, whatever its format.
 
     Args:
         path: the log; the module's docstring lists the formats.
         topic: which `LaserScan` topic of a rosbag to read; needed only where it has
             several.
+        odometry_topic: which `Odometry` topic of a rosbag to believe; without it, the
+            one whose name ends in `odom`, if there are several.
 
     Raises:
-        ValueError: the file is missing, of no supported format, truncated, or holds
-            no scans; a rosbag has several scan topics and `topic` names none of them.
+        ValueError: the file is missing, of no supported format, or holds no scans that
+            can be read; a rosbag has several scan topics and `topic` names none of
+            them, or lacks `odometry_topic`.
         ImportError: the log is a rosbag and the `rosbags` package is not installed.
     """
     path = Path(path)
     if not path.exists():
         raise ValueError(f"there is no log at {path}")
+    log = _read(path, topic, odometry_topic)
+    return replace(log, remarks=(*log.remarks, *_remarks(log)))
+
+
+def _read(path: Path, topic: str | None, odometry_topic: str | None) -> ScanLog:
     kind = path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
     if path.is_dir() or kind in (".bag", ".db3", ".mcap"):
         from fsmsm_jax.io.rosbag import read_rosbag
 
-        return read_rosbag(path, topic)
-    if topic is not None:
+        return read_rosbag(path, topic, odometry_topic)
+    if topic is not None or odometry_topic is not None:
         raise ValueError(
             f"only rosbags have topics, {path.name} is none; drop the topic"
         )
     if kind == ".npz":
-        return _read_npz(path)
+        from fsmsm_jax.io.npz import read_npz
+
+        return read_npz(path)
     if kind in (".log", ".clf"):
         from fsmsm_jax.io.carmen import read_carmen
 
@@ -102,88 +177,22 @@ def read_scans(path: str | Path, topic: str | None = None) -> ScanLog:
     raise ValueError(f"cannot read {path.name}: expected {_SUPPORTED}")
 
 
-def _read_npz(path: Path) -> ScanLog:
-    """One scan (rays,) or many (scans, rays), with what the file says of the sensor."""
-    try:
-        with path.open("rb") as file:
-            archive = np.load(file)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds one unnamed array")
-            found = sorted(archive.files)
-            data = {key: archive[key] for key in found if key in _KEYS}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path.name} is no readable .npz archive: {error}") from error
-
-    if "ranges" not in data:
-        raise ValueError(f"{path.name} needs an array `ranges`, it has {found}")
-    ranges = _numbers(path, "ranges", data["ranges"])
-    if ranges.ndim not in (1, 2) or ranges.size == 0:
-        raise ValueError(
-            f"`ranges` of {path.name} must be a non-empty (rays,) or (scans, rays) "
-            f"array, it has shape {ranges.shape}"
-        )
-    ranges = np.atleast_2d(ranges)
-    limits = [_number(path, key, data[key]) for key in _NO_ECHO_KEYS if key in data]
-    stamps = data.get("stamp", data.get("stamps"))
-    if stamps is not None:
-        stamps = _numbers(path, "stamp", np.atleast_1d(stamps))
-        if stamps.shape != ranges.shape[:1]:
-            raise ValueError(
-                f"{path.name} has {len(ranges)} scans but {stamps.shape} stamps"
+def _remarks(log: ScanLog) -> list[str]:
+    """What is odd about the times and the odometry of any log."""
+    remarks = []
+    if log.stamps is not None:
+        steps = np.diff(log.stamps)
+        if back := np.sum(steps < 0):
+            remarks.append(
+                f"time goes backwards {back} times, the order of the file is kept"
             )
-    ranges, bearings = _without_padding(ranges, _bearings(path, data, ranges.shape))
-    return ScanLog(
-        ranges=ranges,
-        bearings=bearings,
-        range_min=_number(path, "range_min", data.get("range_min", 0.0)),
-        range_max=min(limits, default=_RANGE_MAX),
-        stamps=stamps,
-    )
-
-
-def _bearings(
-    path: Path, data: dict[str, np.ndarray], shape: tuple[int, ...]
-) -> np.ndarray:
-    """`bearings` as given, or from the first angle and the step."""
-    if "bearings" in data:
-        bearings = _numbers(path, "bearings", data["bearings"])
-        if bearings.shape not in (shape, shape[1:]):
-            raise ValueError(
-                f"`bearings` of {path.name} must have shape {shape[1:]} or {shape} as "
-                f"`ranges` has, not {bearings.shape}"
+        if same := np.sum(steps == 0):
+            remarks.append(
+                f"{same} of {len(log)} scans bear the same time as the one before"
             )
-    elif {"angle_min", "angle_increment"} <= data.keys():
-        first = _number(path, "angle_min", data["angle_min"])
-        step = _number(path, "angle_increment", data["angle_increment"])
-        bearings = first + step * np.arange(shape[1])
-    else:
-        raise ValueError(
-            f"{path.name} does not say where its rays point: add `angle_min` and "
-            "`angle_increment` [rad], or `bearings` [rad]"
-        )
-    return np.broadcast_to(bearings, shape)
-
-
-def _without_padding(
-    ranges: np.ndarray, bearings: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """Rays without a direction are padding: NaN their range, give them a bearing."""
-    padding = np.isnan(bearings)
-    return np.where(padding, np.nan, ranges), np.where(padding, 0.0, bearings)
-
-
-def _numbers(path: Path, name: str, values: np.ndarray) -> np.ndarray:
-    if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
-        raise ValueError(
-            f"`{name}` of {path.name} must hold numbers, not {values.dtype}"
-        )
-    return values.astype(float)
-
-
-def _number(path: Path, name: str, value: np.ndarray | float) -> float:
-    array = _numbers(path, name, np.asarray(value))
-    if array.size != 1 or not np.isfinite(array).all():
-        raise ValueError(
-            f"`{name}` of {path.name} must be one finite number, not {value}"
-        )
-    return float(array.reshape(()))
+    if log.odometry is not None:
+        if missing := np.sum(np.isnan(log.odometry).any(axis=1)):
+            remarks.append(
+                f"{missing} of {len(log)} scans have no odometry at their time"
+            )
+    return remarks
