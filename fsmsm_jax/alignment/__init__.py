@@ -55,9 +55,8 @@ from fsmsm_jax.alignment.information import (
     cramer_rao_bound as cramer_rao_bound,
     degenerate_directions as degenerate_directions,
     fisher_information as fisher_information,
-    from_ros as from_ros,
-    to_ros as to_ros,
 )
+from fsmsm_jax.alignment.ros_pose import from_ros as from_ros, to_ros as to_ros
 from fsmsm_jax.alignment.fsmsm_config import (
     Alignment as Alignment,
     FsmsmConfig as FsmsmConfig,

@@ -10,8 +10,7 @@ that the residuals show. If so, it takes the map for a rubber sheet whose displa
 is shared by what stands within a metre, and asks how far such a sheet drags the pose.
 
 A direction that nothing measures, such as the way along a corridor, has a standard
-deviation of 10 m, not none; `degenerate_directions` tells which those are. ROS wants
-a covariance of six numbers: `to_ros` and `from_ros`.
+deviation of 10 m, not none; `degenerate_directions` tells which those are.
 """
 
 import math
@@ -20,7 +19,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float
 
 from fsmsm_jax.alignment.residuals import geman_mcclure, range_residuals, scale_of
 from fsmsm_jax.sensing.lidar import Scan
@@ -32,10 +31,9 @@ __all__ = [
     "Directions",
     "covariance",
     "cramer_rao_bound",
+    "definite",
     "degenerate_directions",
     "fisher_information",
-    "from_ros",
-    "to_ros",
 ]
 
 _UNMEASURED = (10.0, 10.0, math.pi, 0.05)  # [m, m, rad, m] 1σ of what no ray measures
@@ -45,8 +43,8 @@ _SHEET = 1.0  # [m] to which errors of a map extend: what a wall or a cabinet me
 _RUNS = 60  # runs of neighbouring rays whose share of an error is reckoned together
 _MOST_TAKEN = 0.75  # of the errors, by the pose: residuals tell no more of it
 _ROUNDING = 0.1  # times the floor: residuals as small are of computing, not measuring
+_ROUNDING_OF_ONE = 1e-6  # float32's, some ten times over: 1 cm beside 10 m
 _COIN = 2.0  # standard errors above chance from which neighbours count as agreeing
-_PLANE = np.array([0, 1, 5])  # x, y and yaw among ROS's x, y, z, roll, pitch, yaw
 
 
 def fisher_information(
@@ -187,7 +185,16 @@ def covariance(
     taken = slope * jnp.trace(scatter) / jnp.maximum(jnp.sum(vote), 1e-6)
     scatter = scatter / (1 - jnp.minimum(taken, _MOST_TAKEN))
     whole = H @ (prior.T @ prior + scatter) @ H.T
-    return (0.5 * (whole + whole.T))[:3, :3]
+    return definite(0.5 * (whole + whole.T)[:3, :3])
+
+
+def definite(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """A covariance; if rounding has spoilt it, with variances that survive it."""
+    sound = jnp.all(jnp.isfinite(jnp.linalg.cholesky(covariance)))
+    sigma = jnp.sqrt(jnp.abs(jnp.diagonal(covariance)))[:, None]
+    share, axes = jnp.linalg.eigh(covariance / (sigma * sigma.T))
+    root = sigma * axes * jnp.sqrt(jnp.maximum(share, _ROUNDING_OF_ONE))[None]
+    return jnp.where(sound, covariance, root @ root.T)
 
 
 def _shared(e, known):
@@ -259,35 +266,3 @@ def degenerate_directions(
     variance, axes = jnp.linalg.eigh(covariance * arc[:, None] * arc[None])
     sigma = jnp.sqrt(jnp.maximum(variance[::-1], 0.0))
     return Directions(axes.T[::-1] / arc[None], sigma, sigma > limit)
-
-
-def to_ros(covariance: Shaped[np.ndarray, "3 3"] | Array) -> list[float]:
-    """The 36 numbers of a ROS `PoseWithCovariance`, row-major.
-
-    Its rows are x, y, z, roll, pitch, yaw. A planar pose is silent about z, roll and
-    pitch; their entries are 0, as AMCL publishes them. Whoever fuses the pose in three
-    dimensions must leave those three out (`robot_localization`: `two_d_mode`, or false
-    in `pose0_config`), as 0 would read as certainty.
-
-    Example:
-        >>> sent = to_ros(np.diag([0.04, 0.01, 0.001]))
-        >>> len(sent), sent[0], sent[7], sent[35]
-        (36, 0.04, 0.01, 0.001)
-    """
-    full = np.zeros((6, 6))
-    full[np.ix_(_PLANE, _PLANE)] = np.asarray(covariance, float)
-    return full.ravel().tolist()
-
-
-def from_ros(covariance: Shaped[np.ndarray, "..."] | list[float]) -> np.ndarray:
-    """The planar part (3, 3), [m, m, rad]², of a ROS covariance of 36 numbers.
-
-    Raises:
-        ValueError: there are not 36 numbers, flat or as 6 × 6.
-    """
-    given = np.asarray(covariance, float)
-    if given.shape not in ((36,), (6, 6)):
-        raise ValueError(
-            f"a ROS pose covariance has 36 numbers, row-major, got shape {given.shape}"
-        )
-    return given.reshape(6, 6)[np.ix_(_PLANE, _PLANE)]

@@ -11,9 +11,8 @@ from fsmsm_jax.alignment.information import (
     cramer_rao_bound,
     degenerate_directions,
     fisher_information,
-    from_ros,
-    to_ros,
 )
+from fsmsm_jax.alignment.ros_pose import from_ros, to_ros
 from fsmsm_jax.evaluation.metrics import nees, success
 from fsmsm_jax.sensing import Lidar, Scan
 from fsmsm_jax.world import OccupancyGrid, PolygonMap, load_map
