@@ -14,7 +14,9 @@ A tour of the house, in the order in which data passes through it:
 - `calibration`: what all scans have in common and nobody has measured: where the lidar
   sits in the robot, the map's metre and place, bias, scale and noise of the ranges.
 - `localisation`: where am I. `build_atlas` scans a map once; `localise` finds one
-  scan in it, `localise_batch` many.
+  scan in it, `localise_batch` many. `tracker` keeps one pose up at sensor rate;
+  `follow` and `track` do all of it: found, tracked, kidnapped, found again.
+  `particles` keeps a cloud of poses instead of one (Monte Carlo localisation).
 - `evaluation`, `io`, `plotting` and the `fsmsm` command line stand at the edge.
 
 Everything is a pure function of arrays and pytrees: write for one, `jax.vmap` for
@@ -47,13 +49,23 @@ from fsmsm_jax.alignment import (
 from fsmsm_jax import calibration as calibration
 from fsmsm_jax.localisation import (
     AtlasConfig as AtlasConfig,
+    Fix as Fix,
+    FollowConfig as FollowConfig,
     Localisation as Localisation,
+    OdometryModel as OdometryModel,
+    Reading as Reading,
     ScanAtlas as ScanAtlas,
     SearchConfig as SearchConfig,
+    Track as Track,
+    TrackerConfig as TrackerConfig,
     build_atlas as build_atlas,
+    follow as follow,
     localise as localise,
     localise_batch as localise_batch,
     memory_estimate as memory_estimate,
+    particles as particles,
+    track as track,
+    tracker as tracker,
 )
 
 caer = caer_at

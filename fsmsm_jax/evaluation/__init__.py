@@ -51,3 +51,5 @@ from fsmsm_jax.evaluation.stages import (
     translation_walk as translation_walk,
 )
 from fsmsm_jax.evaluation.basins import Basin as Basin, basin as basin
+from fsmsm_jax.evaluation.ways import plan as plan
+from fsmsm_jax.evaluation.drives import Drive as Drive, drive as drive, record as record

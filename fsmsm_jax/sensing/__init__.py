@@ -6,3 +6,4 @@ from fsmsm_jax.sensing.raycast import (
     raycast as raycast,
     raycast_with_jacobian as raycast_with_jacobian,
 )
+from fsmsm_jax.sensing.sweep import moments as moments, unswept as unswept
