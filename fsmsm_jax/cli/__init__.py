@@ -1,10 +1,11 @@
-"""The command line: `fsmsm localise MAP LOG`, `match`, and `demo` to see it work.
+"""The command line: `fsmsm localise MAP LOG`, `match`, `track`, and `demo` as a taste.
 
 All end in a picture. `localise` reads a map_server map and one scan of a log (rosbag,
 CARMEN or .npz) and says where it was taken, how surely, and what else it could have
-been; `match` says so more quickly where a first estimate is at hand. `--json` says it
-to a program. Text and JSON go to stdout, progress to stderr. An error is one line on
-stderr and exit status 2.
+been; `match` says so more quickly where a first estimate is at hand; `track` follows
+the lidar through a whole log. `--json` says it to a program. Text and JSON go to
+stdout, progress to stderr. An error is one line on stderr and exit status 2; Ctrl-C is
+exit status 130.
 
 Compiled programs are kept in $XDG_CACHE_HOME/fsmsm_jax (~/.cache/fsmsm_jax), which
 takes seconds off every run but the first; FSMSM_NO_CACHE=1 turns that off, and
@@ -21,17 +22,18 @@ import tyro
 
 from fsmsm_jax.cli.localise import localise
 from fsmsm_jax.cli.match import match
+from fsmsm_jax.cli.track import track
 from fsmsm_jax.cli.demo import demo
 
-__all__ = ["demo", "localise", "main", "match"]
+__all__ = ["demo", "localise", "main", "match", "track"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status is 0, or 2 after an error."""
+    """Run one command; the exit status is 0, 2 after an error, 130 after Ctrl-C."""
     try:
         _keep_compiled_programs()
         tyro.extras.subcommand_cli_from_dict(
-            {"localise": localise, "match": match, "demo": demo},
+            {"localise": localise, "match": match, "track": track, "demo": demo},
             prog="fsmsm",
             description="Where is my lidar? 2D lidar localisation against a map.",
             args=arguments,
@@ -43,6 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         print(f"fsmsm: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("fsmsm: interrupted", file=sys.stderr)
+        return 130
     return 0
 
 

@@ -1,5 +1,6 @@
 """What the commands share: timing, the words for a scan and a pose, saved pictures."""
 
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import jax
 import numpy as np
 
+from fsmsm_jax.io.logs import ScanLog
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid
 
@@ -44,6 +46,12 @@ def pose_in_words(pose, covariance) -> str:
         f"x {x:.3f} m ± {sx:.3f}, y {y:.3f} m ± {sy:.3f}, "
         f"heading {np.rad2deg(theta):.2f}° ± {np.rad2deg(st):.2f}  (1σ)"
     )
+
+
+def tell_remarks(log: ScanLog) -> None:
+    """What is odd about a log, on stderr."""
+    for remark in log.remarks:
+        print(f"remark    {remark}", file=sys.stderr)
 
 
 def save_picture(path: Path, draw: Callable[["Axes"], object]) -> None:

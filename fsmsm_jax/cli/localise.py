@@ -8,7 +8,14 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from fsmsm_jax.cli.console import area, pose_in_words, save_picture, summary, timed
+from fsmsm_jax.cli.console import (
+    area,
+    pose_in_words,
+    save_picture,
+    summary,
+    tell_remarks,
+    timed,
+)
 from fsmsm_jax.io.logs import read_scans
 from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas, build_atlas
 from fsmsm_jax.localisation.search import Localisation, localise as localise_scan
@@ -41,7 +48,9 @@ def localise(
         atlas: file that keeps the atlas: loaded if it is there, else built and saved.
     """
     world = load_map(map)
-    scan = read_scans(log, topic).scan(index)
+    scans = read_scans(log, topic)
+    tell_remarks(scans)
+    scan = scans.scan(index)
     scan_atlas, atlas_time = timed(lambda: load_or_build_atlas(world, spacing, atlas))
     result, first, warm = localise_twice(scan_atlas, scan)
     timing = {"atlas": atlas_time, "first_query": first, "query": warm}

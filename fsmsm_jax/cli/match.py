@@ -13,7 +13,14 @@ from jaxtyping import Array, Float
 from fsmsm_jax.alignment.fast import FastConfig
 from fsmsm_jax.alignment.fsmsm_config import FsmsmConfig
 from fsmsm_jax.alignment.match import Match, match as match_scan
-from fsmsm_jax.cli.console import area, pose_in_words, save_picture, summary, timed
+from fsmsm_jax.cli.console import (
+    area,
+    pose_in_words,
+    save_picture,
+    summary,
+    tell_remarks,
+    timed,
+)
 from fsmsm_jax.geometry import transform_points
 from fsmsm_jax.io.logs import read_scans
 from fsmsm_jax.sensing.lidar import Scan
@@ -53,7 +60,9 @@ def match(
         picture: where to write the picture; none for no picture.
     """
     world = load_map(map)
-    scan = read_scans(log, topic).scan(index)
+    scans = read_scans(log, topic)
+    tell_remarks(scans)
+    scan = scans.scan(index)
     x, y, degrees = initial
     start = jnp.array([x, y, np.deg2rad(degrees)])
     config = FastConfig()

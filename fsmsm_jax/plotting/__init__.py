@@ -2,7 +2,7 @@
 
 `localisation` shows one answer on its map; `thesis` shows what many answers are worth:
 the figures of the published evaluation, with the published numbers on them; `basins`
-from how far off a matcher still finds home.
+from how far off a matcher still finds home; `tracking` the way of a robot.
 
 Import this package by its name; `import fsmsm_jax` alone does not load matplotlib.
 """
@@ -29,3 +29,8 @@ from fsmsm_jax.plotting.thesis import (
     plot_sweep as plot_sweep,
 )
 from fsmsm_jax.plotting.basins import plot_basin as plot_basin
+from fsmsm_jax.plotting.tracking import (
+    plot_error_over_time as plot_error_over_time,
+    plot_particles as plot_particles,
+    plot_track as plot_track,
+)
