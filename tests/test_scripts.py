@@ -65,3 +65,37 @@ def test_bench_accuracy_quickly(tmp_path):
     for title in ("polygon worlds", "Noise in the map, too", "occupancy grid", "Speed"):
         assert title in tables
     assert "real lidar" not in tables
+
+
+@pytest.mark.slow
+def test_bench_tracking_quickly(data, tmp_path):
+    """One recording, kidnapped twice and timed."""
+    page = tmp_path / "tracking.md"
+    command = [sys.executable, "scripts/bench_tracking.py", "--quick"]
+    run = subprocess.run(
+        [*command, "--only", "kidnap", "steps", "--markdown", str(page)],
+        cwd=ROOT,
+        env=os.environ | {"FSMSM_DATA": str(data)},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    for title in ("Kidnapped", "False alarms", "A step of the tracker"):
+        assert f"### {title}" in page.read_text()
+
+
+@pytest.mark.slow
+def test_reproduce_particles_quickly(tmp_path):
+    """The parts that need no recordings."""
+    page = tmp_path / "particles.md"
+    command = [sys.executable, "scripts/reproduce_particles.py", "--quick"]
+    run = subprocess.run(
+        [*command, "--only", "corridor", "speed", "--markdown", str(page)],
+        cwd=ROOT,
+        env=os.environ | {"FSMSM_DATA": str(tmp_path / "no")},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "updates/s" in page.read_text()
+    assert "CORRIDOR" not in page.read_text()
