@@ -99,7 +99,7 @@ def correct(
     prior = jax.vmap(lambda pose: _motion_cost(pose, predicted, certainty, config.slip))
     chosen = poses[jnp.argmax(config.voices * witness - prior(poses))]
 
-    off = deviation(world, scan, chosen)
+    off = deviation(world, few, chosen)
     fitted, thickness = fit_ranges(world, scan, chosen, config.finish, config.reach)
     fits = jnp.where(jnp.isnan(usual), off, usual) < jnp.asarray(config.wrong)
     return jnp.where(fits, fitted, chosen), jnp.where(fits, thickness, 0.0), off

@@ -85,7 +85,6 @@ def amcl(options) -> Iterator[Table]:
             alpha_slow=0.001,
             alpha_fast=0.1,
             motion_params=motion,
-            laser_likelihood_max_dist=2.0,
             laser_params=laser,
             robot_model_type="differential",
         )
