@@ -47,6 +47,7 @@ def recorded(tmp_path_factory):
     timed = content | {"stamp": STAMPS}
     np.savez(folder / "log.npz", **timed, odometry=odometry)
     np.savez(folder / "plain.npz", **content)
+    np.savez(folder / "swept.npz", **timed, time_increment=5e-4)
     odometry[3:6] = np.nan
     np.savez(folder / "holes.npz", **timed, odometry=odometry)
     np.savez(folder / "dark.npz", **timed | {"ranges": np.full_like(ranges, 31.0)})
@@ -254,6 +255,11 @@ def test_errors_are_one_line_and_status_two(recorded, capsys, options, message):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("fsmsm: error: ")
     assert message in line
+
+
+def test_compensation_without_odometry_would_swing(recorded, capsys):
+    assert track(recorded, "--sweep", "stated", log="swept.npz") == 2
+    assert "needs odometry" in capsys.readouterr().err
 
 
 def test_localise_tells_what_is_odd_about_a_log(recorded, capsys):

@@ -75,7 +75,7 @@ def track(
     start = None if initial is None else _start(world, initial)
     scans = read_scans(log, topic, odometry_topic)
     odometry = None if no_odometry else scans.odometry
-    readings = stacked(scans.scans(), odometry, _moments(scans, sweep))
+    readings = stacked(scans.scans(), odometry, _moments(scans, sweep, odometry))
     stamps, remarks = _times(scans)
     picture = _picture(plot, out)
     if out is not None:
@@ -135,7 +135,9 @@ def _start(
     return start
 
 
-def _moments(log: ScanLog, sweep: str) -> Float[np.ndarray, "scans rays"] | None:
+def _moments(
+    log: ScanLog, sweep: str, odometry: np.ndarray | None
+) -> Float[np.ndarray, "scans rays"] | None:
     """When each ray was taken, for `Reading`; None if nobody wants to know."""
     if sweep == "none":
         return None
@@ -143,6 +145,11 @@ def _moments(log: ScanLog, sweep: str) -> Float[np.ndarray, "scans rays"] | None
         raise ValueError(
             f"--sweep {sweep}: the log does not say when its rays were taken; "
             "leave --sweep out"
+        )
+    if odometry is None and np.nanmax(log.ray_times) > 0:
+        raise ValueError(
+            f"--sweep {sweep} needs odometry here: rays are timed after the scan's "
+            "stamp, and a motion guessed from the poses before would make them swing"
         )
     times = log.reversed_sweep().ray_times if sweep == "reversed" else log.ray_times
     return moments(log.stamps, np.asarray(times))

@@ -73,7 +73,8 @@ class Reading(NamedTuple):
     odometry: Float[Array, "3"] | Shaped[np.ndarray, "3"] | None = None
     """Pose of the lidar in the odometry frame [m, m, rad]; NaN or None if unknown."""
     moments: Float[Array, "rays"] | Shaped[np.ndarray, "rays"] | None = None
-    """When each ray was taken (`sensing.unswept`), −1 being the scan before."""
+    """When each ray was taken (`sensing.unswept`), −1 being the scan before. Moments
+    after the stamp (> 0) want odometry: a motion guessed from the last poses swings."""
 
 
 class Fix(NamedTuple):
