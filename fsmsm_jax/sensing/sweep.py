@@ -25,7 +25,7 @@ def fraction(motion: Float[Array, "3"], share: Float[Array, ""]) -> Float[Array,
 
     Example:
         >>> quarter = jnp.array([1.0, 1.0, jnp.pi / 2])  # of a circle of radius 1
-        >>> fraction(quarter, jnp.asarray(-1.0)).round(3).tolist()
+        >>> [round(v, 3) for v in fraction(quarter, jnp.asarray(-1.0)).tolist()]
         [-1.0, 1.0, -1.571]
     """
     # A chord of an arc of angle θ leaves at θ/2 and measures 2 R sin(θ/2).
