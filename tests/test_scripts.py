@@ -69,18 +69,18 @@ def test_bench_accuracy_quickly(tmp_path):
 
 @pytest.mark.slow
 def test_bench_tracking_quickly(data, tmp_path):
-    """One recording, kidnapped twice and timed."""
+    """One recording, kidnapped twice."""
     page = tmp_path / "tracking.md"
     command = [sys.executable, "scripts/bench_tracking.py", "--quick"]
     run = subprocess.run(
-        [*command, "--only", "kidnap", "steps", "--markdown", str(page)],
+        [*command, "--only", "kidnap", "--markdown", str(page)],
         cwd=ROOT,
         env=os.environ | {"FSMSM_DATA": str(data)},
         capture_output=True,
         text=True,
     )
     assert run.returncode == 0, run.stderr
-    for title in ("Kidnapped", "False alarms", "A step of the tracker"):
+    for title in ("Kidnapped", "False alarms"):
         assert f"### {title}" in page.read_text()
 
 
