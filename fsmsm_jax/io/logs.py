@@ -112,8 +112,8 @@ class ScanLog:
 
         Drivers of RPLidars, which turn clockwise, list the rays counter-clockwise and
         leave the time from ray to ray positive. Nothing in a log tells; compensating
-        the motion in a turn with times of the wrong order makes scans twice as bad
-        (the recording mac_turtlebot4_take2 is such a log).
+        the motion in a turn with times of the wrong order makes scans worse than they
+        were (the recording mac_turtlebot4_take2 is such a log).
 
         Raises:
             ValueError: the log has no `ray_times`.

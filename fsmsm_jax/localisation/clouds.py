@@ -89,8 +89,8 @@ def init_from_atlas(
     """A cloud about the places that the first scan may come from.
 
     `localise` names up to 32 distinct places; each gets particles by its likelihood, as
-    if 20 rays of the scan were independent. Five hundred particles then do what
-    takes tens of thousands that are spread over the map.
+    if 20 rays of the scan were independent. So room for some hundred particles may do
+    where an even spread wants many more.
 
     Args:
         key: of the draw.

@@ -164,8 +164,8 @@ def _better(found, state, info, config):
     """Whether another place explains the scan clearly better, and as well as usual."""
     score = found.candidates.scores[0]
     as_usual = score > state.score - config.tracker.slack
-    open = 1 - found.explained < config.still_open * (1 - info.explained)
-    return (score > info.score + config.better) & as_usual & open
+    explains = 1 - found.explained < config.still_open * (1 - info.explained)
+    return (score > info.score + config.better) & as_usual & explains
 
 
 def _search(atlas, contest, reading, config):
@@ -190,9 +190,9 @@ def _decide(contest, infos, config):
     if stays and (lead > config.lead or contest.scans >= _AGAIN):
         return winner(contest, first), of(first, "tracking")
     if contest.incumbent:
-        open = 1 - infos.explained
+        rest = 1 - infos.explained
         beaten = contest.totals[first] - contest.totals[0] > config.overthrow
-        beaten &= open[first] < config.still_open * open[0]
+        beaten &= rest[first] < config.still_open * rest[0]
         if not beaten and contest.scans < _AGAIN:
             return contest, of(0, "doubted")
         if not beaten:
