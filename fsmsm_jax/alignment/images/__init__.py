@@ -1,0 +1,1 @@
+"""Tools of `fmi_spomf`: images turned into shifts, and shifts found."""
