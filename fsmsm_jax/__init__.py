@@ -11,6 +11,8 @@ A tour of the house, in the order in which data passes through it:
 - `alignment`: one scan against another. Orientation by circular correlation, position
   by the first harmonic, `caer` for how alike two scans are, and descent on exact
   derivatives. `match` puts them together: a scan, a map, and about where.
+  `match_scans` needs no map: the first of two scans is the world of the second.
+  `register_images` does it with pictures.
 - `calibration`: what all scans have in common and nobody has measured: where the lidar
   sits in the robot, the map's metre and place, bias, scale and noise of the ranges.
 - `localisation`: where am I. `build_atlas` scans a map once; `localise` finds one
@@ -44,7 +46,10 @@ from fsmsm_jax.alignment import (
     caer_at,
     match as match,
     match_batch as match_batch,
+    match_scans as match_scans,
+    match_scans_batch as match_scans_batch,
     refine as refine,
+    register_images as register_images,
 )
 from fsmsm_jax import calibration as calibration
 from fsmsm_jax.localisation import (

@@ -99,3 +99,39 @@ def test_reproduce_particles_quickly(tmp_path):
     assert run.returncode == 0, run.stderr
     assert "updates/s" in page.read_text()
     assert "CORRIDOR" not in page.read_text()
+
+
+@pytest.mark.slow
+def test_reproduce_fsm_quickly(tmp_path):
+    """In generated offices, where nothing published holds."""
+    nothing = {"FSMSM_DATA": str(tmp_path / "no"), "FSMSM_GOLDEN": str(tmp_path / "no")}
+    page = tmp_path / "fsm.md"
+    command = [sys.executable, "scripts/reproduce_fsm.py", "--quick"]
+    run = subprocess.run(
+        [*command, "--only", "golden", "protocol", "--markdown", str(page)],
+        cwd=ROOT,
+        env=os.environ | nothing,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "### Scan against scan: Position errors" in page.read_text()
+    assert "generated offices" in page.read_text()
+    assert "C++" not in page.read_text()  # its results are not at hand
+
+
+@pytest.mark.slow
+def test_reproduce_fmi_quickly(tmp_path):
+    """Without maps a generated office stands in, and says so."""
+    page = tmp_path / "fmi.md"
+    command = [sys.executable, "scripts/reproduce_fmi.py", "--quick"]
+    run = subprocess.run(
+        [*command, "--only", "global", "--markdown", str(page)],
+        cwd=ROOT,
+        env=os.environ | {"FSMSM_DATA": str(tmp_path / "no")},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "### generated office" in page.read_text()
+    assert "in place of the thesis's maps" in run.stderr

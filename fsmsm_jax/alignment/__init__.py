@@ -64,10 +64,30 @@ from fsmsm_jax.alignment.fsmsm_config import (
 from fsmsm_jax.alignment.fsmsm import fsmsm as fsmsm
 from fsmsm_jax.alignment.fast import (
     FastConfig as FastConfig,
+    approach as approach,
     fast_match as fast_match,
 )
 from fsmsm_jax.alignment.match import (
     Match as Match,
     match as match,
     match_batch as match_batch,
+)
+from fsmsm_jax.alignment.views import (
+    View as View,
+    fit_views as fit_views,
+    view_covariance as view_covariance,
+    view_residuals as view_residuals,
+)
+from fsmsm_jax.alignment.fsm import (
+    fast_fsm as fast_fsm,
+    fsm as fsm,
+    match_scans as match_scans,
+    match_scans_batch as match_scans_batch,
+)
+from fsmsm_jax.alignment.fmi_spomf import (
+    FmiConfig as FmiConfig,
+    Registration as Registration,
+    fmi_spomf as fmi_spomf,
+    register_images as register_images,
+    rotation_and_scale as rotation_and_scale,
 )

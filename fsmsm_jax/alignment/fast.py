@@ -28,7 +28,7 @@ from fsmsm_jax.alignment.theseus import distinct_headings
 from fsmsm_jax.sensing import Scan, raycast_with_jacobian
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
-__all__ = ["FastConfig", "fast_match"]
+__all__ = ["FastConfig", "approach", "fast_match"]
 
 _LEAN = (2.0, 1.0, 0.7, 0.5, 0.3)  # [m] kernel scales, without a cast
 _LOOK = (0.6, 0.4, 0.3)  # [m] the same after each cast
@@ -92,11 +92,23 @@ def fast_match(
         Pure and of fixed length, for `vmap` and `jit`. `match` checks its input, judges
         the answer and adds the covariance; this is the engine.
     """
+    found = approach(world, panorama, pose, config)
+    return fit_ranges(world, scan, found, config.finish, config.box[0])
+
+
+def approach(
+    world: OccupancyGrid | PolygonMap,
+    panorama: Scan,
+    pose: Float[Array, "3"],
+    config: FastConfig = FastConfig(),
+) -> Float[Array, "3"]:
+    """`fast_match` up to the finish: turn, lean and look. Centimetres are missing."""
     look = lambda pose: raycast_with_jacobian(
         world, pose, panorama.bearings, panorama.range_max
     )
     reach = config.stray * jnp.asarray(config.box, pose.dtype)
     virtual, J = look(pose)
+    veiled = isinstance(world, PolygonMap) and world.solid is not None
     turns = distinct_headings(
         panorama.ranges,
         virtual,
@@ -105,6 +117,7 @@ def fast_match(
         config.headings,
         jnp.asarray(config.apart),
         panorama.valid,
+        virtual < panorama.range_max if veiled else None,
     ).corrections
 
     def lean(turn):
@@ -122,8 +135,7 @@ def fast_match(
     _, best = jax.lax.top_k(-costs, config.kept)
     walk = lambda start: jax.lax.scan(step, start, length=config.looks)[0]
     walked, costs = jax.vmap(walk)((leaned[best], costs[best]))
-    found = walked[jnp.argmin(costs)]
-    return fit_ranges(world, scan, found, config.finish, config.box[0])
+    return walked[jnp.argmin(costs)]
 
 
 def _fit_linear(view, scan, scales, cap):

@@ -17,7 +17,7 @@ from fsmsm_jax.alignment.fsmsm_config import FsmsmConfig
 from fsmsm_jax.sensing import Scan
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
-__all__ = ["checked", "into_the_open", "one_world", "strayed"]
+__all__ = ["check_scans", "checked", "into_the_open", "one_world", "strayed"]
 
 _FEWEST_RAYS = 8  # of a panorama: a heading and a first harmonic need some
 _FEWEST_ECHOES = 10  # three numbers are wanted, and some rays hit what is not drawn
@@ -25,21 +25,19 @@ _SIDE = 11  # positions tried along a side of the box, to find one in the open
 
 
 def checked(
-    worlds: OccupancyGrid | PolygonMap,
+    worlds: OccupancyGrid | PolygonMap | None,
     scans: Scan,
     poses: Sequence | np.ndarray | Array,
     rays: int,
 ) -> Float[Array, "scans 3"]:
     """The poses as an array, headings wrapped, if all inputs are sound.
 
+    Without `worlds`, scans and poses only.
+
     Raises:
         ValueError: what `match_batch` says of its input.
     """
-    if np.ndim(scans.ranges) != 2:
-        raise ValueError(
-            f"expected scans with (scans, rays) ranges, got {np.shape(scans.ranges)}; "
-            "match_batch takes many scans, match one"
-        )
+    check_scans(scans)
     if rays < _FEWEST_RAYS:
         raise ValueError(
             f"a panorama needs at least {_FEWEST_RAYS} rays to match, got {rays}"
@@ -57,10 +55,26 @@ def checked(
             f"pose {n} is {poses[n].tolist()}; a match starts from finite numbers. "
             "Without an estimate, `localise` finds one"
         )
-    if not one_world(worlds):
+    if worlds is not None and not one_world(worlds):
         maps = len(jax.tree.leaves(worlds)[0])
         if maps != count:
             raise ValueError(f"expected one map or one a scan ({count}), got {maps}")
+    poses[:, 2] = np.mod(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
+    return jnp.asarray(poses, scans.ranges.dtype)
+
+
+def check_scans(scans: Scan) -> None:
+    """Refuse a batch of scans that nothing can be matched with.
+
+    Raises:
+        ValueError: no batch or an empty one, more than one `range_max`, or hardly
+            an echo.
+    """
+    if np.ndim(scans.ranges) != 2 or len(scans.ranges) == 0:
+        raise ValueError(
+            f"expected scans with (scans, rays) ranges, got {np.shape(scans.ranges)}; "
+            "functions that end in _batch take many scans, the others one"
+        )
     limits = np.asarray(scans.range_max)
     if np.ptp(limits) > 0:
         raise ValueError(
@@ -74,8 +88,6 @@ def checked(
             f"at least {_FEWEST_ECHOES} to say where they are seen from; check "
             "range_max and units"
         )
-    poses[:, 2] = np.mod(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
-    return jnp.asarray(poses, scans.ranges.dtype)
 
 
 def into_the_open(

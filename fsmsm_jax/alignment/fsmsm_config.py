@@ -118,6 +118,31 @@ class FsmsmConfig(eqx.Module):
             max_recoveries=100,
         )
 
+    @classmethod
+    def scan_to_scan(cls, translations: int = 2) -> "FsmsmConfig":
+        """The settings of FSM, scan against scan (`match_scans`).
+
+        Args:
+            translations: I_T(ν) = translations · (1 + ν) steps of the position law: 2
+                in the thesis's program, 5 in its text, which takes longer and ends in
+                the same place.
+
+        Reference:
+            Algorithm XXIV of the thesis and the defaults of its program (`fsm.h`).
+        """
+        levels = (0, 1, 2, 3)
+        return cls(
+            headings=0,
+            cap=math.inf,
+            levels=levels,
+            translations=tuple(translations * (1 + nu) for nu in levels),
+            finish=0,
+            max_steps=200,
+            memory="turn",
+            stray=math.inf,
+            max_recoveries=10,
+        )
+
 
 class Alignment(NamedTuple):
     """What `fsmsm` found."""

@@ -34,6 +34,7 @@ __all__ = [
     "definite",
     "degenerate_directions",
     "fisher_information",
+    "inverse_root",
 ]
 
 _UNMEASURED = (10.0, 10.0, math.pi, 0.05)  # [m, m, rad, m] 1σ of what no ray measures
@@ -92,11 +93,13 @@ def cramer_rao_bound(
         in a corridor. For many poses, `vmap`.
     """
     _, J = raycast_with_jacobian(world, pose, bearings, range_max)
-    H, _ = _inverse_root(J / sigma)
+    H, _ = inverse_root(J / sigma)
     return H @ H.T
 
 
-def _inverse_root(J):
+def inverse_root(
+    J: Float[Array, "rays unknowns"],
+) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, "unknowns unknowns"]]:
     """H with H Hᵀ = (JᵀJ + P)⁻¹, by QR, and the root of P, what is known without J."""
     unknowns = J.shape[1]
     known_before = jnp.diag(1 / jnp.asarray(_UNMEASURED[:unknowns], J.dtype))
@@ -171,7 +174,7 @@ def covariance(
 
     # A⁻¹ = H Hᵀ; the scatter of the score is reckoned in H's coordinates, near I.
     rows = jnp.sqrt(vote * slope / v)[:, None] / stretch[:, None] * J
-    H, known_before = _inverse_root(rows)
+    H, known_before = inverse_root(rows)
     score = (rows @ H) * jnp.sqrt(vote / slope)[:, None] / stretch[:, None]
     prior = known_before @ H
     # A ray on which much of the pose rests may be wrong in its derivative as well:

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from fsmsm_jax.alignment.blocks import as_batch, first, in_blocks
 from fsmsm_jax.alignment.caer import caer_per_ray
 from fsmsm_jax.alignment.fast import FastConfig, fast_match
 from fsmsm_jax.alignment.first_estimate import (
@@ -40,7 +41,6 @@ from fsmsm_jax.world import OccupancyGrid, PolygonMap
 __all__ = ["Match", "match", "match_batch"]
 
 _AGREEING, _MOST = 0.3, 0.5  # [m] a ray may be off; share of the rays that are not
-_TOGETHER = 64  # scans at once: enough to fill vectors, few enough for the cache
 _CAN_MASK = "fourier_mellin"  # the method of FSMSM that can do without some rays
 _KERNEL = 0.3  # [m] of the polish that finds the walls' thickness, as in `localise`
 
@@ -125,8 +125,8 @@ def match(
             f"a pose is [x, y, θ], three numbers [m, m, rad]; got {np.shape(pose)}"
         )
     poses = np.asarray(pose, float)[None]
-    found = match_batch(world, _as_batch(scan), poses, config, rays=rays, key=key)
-    return _first(found)
+    found = match_batch(world, as_batch(scan), poses, config, rays=rays, key=key)
+    return first(found)
 
 
 def match_batch(
@@ -173,24 +173,10 @@ def match_batch(
     shared = worlds if one_world(worlds) else None
     own = None if one_world(worlds) else worlds
     jobs = (own, scans, panoramas, poses, starts, found)
-    return _in_blocks(lambda block: _match(shared, block, config), jobs, len(poses))
+    return in_blocks(lambda block: _match(shared, block, config), jobs, len(poses))
 
 
-# Compiled, since array by array they would take as long as the match itself.
-_as_batch = jax.jit(lambda tree: jax.tree.map(lambda a: a[None], tree))
-_first = jax.jit(lambda tree: jax.tree.map(lambda a: a[0], tree))
-_some = jax.jit(lambda tree, index: jax.tree.map(lambda a: a[index], tree))
 _panoramas = jax.jit(jax.vmap(panorama, (0, None)), static_argnums=1)
-
-
-def _in_blocks(run, jobs, count):
-    """Some at a time. The last block is filled up: one program serves any number."""
-    if count <= _TOGETHER:
-        return run(jobs)
-    index = np.minimum(np.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1)
-    blocks = np.split(index, len(index) // _TOGETHER)
-    done = [run(_some(jobs, block)) for block in blocks]
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:count], *done)
 
 
 @jax.jit

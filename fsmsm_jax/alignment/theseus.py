@@ -132,6 +132,7 @@ def distinct_headings(
     count: int,
     apart: float | Float[Array, ""],
     mask: Bool[Array, "rays"] | None = None,
+    fine_mask: Bool[Array, "fine"] | None = None,
 ) -> Candidates:
     """The best heading corrections in a sector that are apart from each other.
 
@@ -147,6 +148,7 @@ def distinct_headings(
         count: how many to find; static. The best is repeated if there are fewer.
         apart: least angle between two of them [rad].
         mask: valid rays of the real scan; all if left out.
+        fine_mask: rays of the virtual scan that know something; all if left out.
 
     Returns:
         The candidates, best first. Their similarity is 1 / (1 + cost), their `caer`
@@ -164,9 +166,11 @@ def distinct_headings(
     steps = _steps(ranges, fine_virtual)
     everywhere = jnp.ones(ranges.shape, bool)
     compress = lambda ranges: jnp.log(ranges + _NEAR)
+    fine_mask = jnp.ones(fine_virtual.shape, bool) if fine_mask is None else fine_mask
     R = Spectrum.of(compress(ranges), everywhere if mask is None else mask)
-    cost = lambda v: heading_costs(R, Spectrum.of(compress(v), everywhere))
-    costs = jax.vmap(cost)(fine_virtual.reshape(ranges.size, steps).T).T.reshape(-1)
+    cost = lambda v, known: heading_costs(R, Spectrum.of(compress(v), known))
+    dealt = lambda fine: fine.reshape(ranges.size, steps).T
+    costs = jax.vmap(cost)(dealt(fine_virtual), dealt(fine_mask)).T.reshape(-1)
     turns = jnp.arange(fine_virtual.size) * (2 * jnp.pi / fine_virtual.size)
     turns = turns.astype(ranges.dtype)
     possible = jnp.abs(geometry.wrap(turns - centre)) <= half_width

@@ -165,7 +165,7 @@ def corrected(
         moved, frame.scale * geometry.transform_points(to_pivot, points)
     )
     if isinstance(world, PolygonMap):
-        return PolygonMap(start=place(world.start), end=place(world.end))
+        return PolygonMap(place(world.start), place(world.end), world.solid)
     origin = jnp.append(
         place(world.origin[:2]), geometry.wrap(world.origin[2] + frame.shift[2])
     )

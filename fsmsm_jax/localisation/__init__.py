@@ -47,3 +47,8 @@ from fsmsm_jax.localisation.clouds import (
     init_from_atlas as init_from_atlas,
     init_uniform as init_uniform,
 )
+from fsmsm_jax.localisation.pgl_fmic import (
+    PglFmic as PglFmic,
+    PglFmicConfig as PglFmicConfig,
+    pgl_fmic as pgl_fmic,
+)

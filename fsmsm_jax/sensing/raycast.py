@@ -44,8 +44,8 @@ def raycast(
         world: an `OccupancyGrid` or a `PolygonMap`.
         pose: [x, y, θ] of the sensor in the map frame [m, m, rad].
         bearings: directions of the rays in the sensor frame [rad].
-        range_max: cap [m]; rays that meet nothing nearer read exactly this. A pose
-            outside a grid sees nothing.
+        range_max: cap [m]; rays that meet nothing nearer, or a veil of a polygon first,
+            read exactly this. A pose outside a grid sees nothing.
 
     Returns:
         One range [m] per bearing, in [0, range_max].
@@ -146,8 +146,10 @@ def _hit_segments(world, position, headings, range_max):
     blocks = walls.reshape(7, blocks, together).transpose(1, 0, 2)
     (closeness, index), _ = jax.lax.scan(block, start, blocks)
     hit = closeness * range_max > 1
-    ranges = jnp.where(hit, 1 / jnp.where(hit, closeness, 1.0), range_max)
     wall = index.astype(int)
+    if world.solid is not None:
+        hit &= world.solid[wall]
+    ranges = jnp.where(hit, 1 / jnp.where(hit, closeness, 1.0), range_max)
     return ranges, *_towards_sensor(w[0, wall], w[1, wall], dx, dy, hit)
 
 

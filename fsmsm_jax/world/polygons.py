@@ -3,6 +3,11 @@
 The thesis's environments are closed outlines of points. A `PolygonMap` keeps
 them as segments, start to end, so that several outlines (a room and the pillars
 in it) are one array and a ray meets each segment by two lines of algebra.
+
+What a scan has seen is such a world too (`sensing.seen_space`), but it ends in places
+where nothing stands: at the border of the field of view, or beside an object that
+hides what is behind it. There its outline is a veil, not a wall: where a ray meets it
+first, nothing is known.
 """
 
 from collections.abc import Sequence
@@ -22,6 +27,9 @@ class PolygonMap(eqx.Module):
     """First end of each wall, map frame [m]."""
     end: Float[Array, "segments 2"]
     """Second end of each wall, map frame [m]."""
+    solid: Bool[Array, "segments"] | None = None
+    """Which segments are walls and not veils; all, if None. A ray that meets a veil
+    first reads `range_max`, as one that meets nothing."""
 
     @classmethod
     def from_outlines(cls, *outlines: Sequence | np.ndarray | Array) -> "PolygonMap":
@@ -62,7 +70,10 @@ class PolygonMap(eqx.Module):
         )
 
     def distance_at(self, points: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
-        """Distance [m] from map-frame points to the nearest wall; differentiable."""
+        """Distance [m] from map-frame points to the nearest wall; differentiable.
+
+        Veils are none; without any wall it is infinite.
+        """
         x, y = points[..., 0, None], points[..., 1, None]  # points down, walls across
         each = (1,) * (points.ndim - 1) + (-1,)
         (ax, ay), (bx, by) = (
@@ -73,6 +84,8 @@ class PolygonMap(eqx.Module):
         length2 = jnp.maximum(wx**2 + wy**2, jnp.finfo(wx.dtype).tiny)
         along = jnp.clip(((x - ax) * wx + (y - ay) * wy) / length2, 0, 1)
         gap2 = (x - ax - along * wx) ** 2 + (y - ay - along * wy) ** 2
+        if self.solid is not None:
+            gap2 = jnp.where(self.solid.reshape(each), gap2, jnp.inf)
         gap2 = gap2.min(axis=-1)
         # The square root has no slope at a wall; a millionth of a metre gives it one.
         return jnp.sqrt(gap2 + 1e-12)

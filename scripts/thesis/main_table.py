@@ -57,7 +57,7 @@ def main(options: Options) -> Iterator[Table]:
 def _main_tables(asked, results) -> Iterator[Table]:
     order = sorted(results, key=lambda key: (key[2], key[1], NAMES.index(key[0])))
     answers, costs, weighted = [], [], []
-    weights = _thesis_weights(asked)
+    weights = thesis_weights(asked)
     for name, *cell in order:
         row, seconds = results[name, *cell]
         where = tuple(cell)
@@ -94,11 +94,11 @@ def _main_tables(asked, results) -> Iterator[Table]:
             weighted.append(
                 (
                     *at,
-                    number(100 * _weighted(row.errors.success, weights)[1], 4),
+                    number(100 * weighted_middle(row.errors.success, weights)[1], 4),
                     number(success[0], 4) if success else "",
-                    pair(_weighted(row.errors.position, weights), 1e3),
+                    pair(weighted_middle(row.errors.position, weights), 1e3),
                     pair(theirs(published.POSITION)),
-                    pair(_weighted(row.errors.orientation, weights), 1e3),
+                    pair(weighted_middle(row.errors.orientation, weights), 1e3),
                     pair(theirs(published.ORIENTATION)),
                 )
             )
@@ -157,14 +157,14 @@ def _main_tables(asked, results) -> Iterator[Table]:
         yield _by_set(asked, results)
 
 
-def _thesis_weights(asked: Asked) -> np.ndarray | None:
+def thesis_weights(asked: Asked) -> np.ndarray | None:
     if set(asked.names) != set(published.SCANS):
         return None
     weights = np.array([published.SCANS[asked.names[s]] for s in asked.sets], float)
     return weights / weights.sum()
 
 
-def _weighted(sample: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+def weighted_middle(sample: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
     """Median and mean of a weighted sample."""
     order = np.argsort(sample)
     middle = np.searchsorted(np.cumsum(weights[order]), 0.5)

@@ -13,6 +13,7 @@ from thesis.published import METHODS, SCANS
 
 from fsmsm_jax.alignment import Alignment, FsmsmConfig, fsmsm
 from fsmsm_jax.evaluation import (
+    DISPLACEMENTS,
     FARTHEST,
     Cases,
     close_half_scans,
@@ -57,7 +58,12 @@ class Asked(NamedTuple):
         return f"{count} worlds{parts} of {names}."
 
 
-def five_sets(options: Options, key: int = 0, worlds: int | None = None) -> Asked:
+def five_sets(
+    options: Options,
+    key: int = 0,
+    worlds: int | None = None,
+    displacement: tuple[float, float] = DISPLACEMENTS[-1],
+) -> Asked:
     """Equal parts of the five recordings of §6.5; more than there are come again."""
     wanted = min(options.worlds, worlds or options.worlds)
     per_set = max(1, wanted // len(SCANS))
@@ -65,8 +71,9 @@ def five_sets(options: Options, key: int = 0, worlds: int | None = None) -> Aske
     if file and file.is_file():
         with np.load(file) as arrays:
             halves = {name: arrays[f"{name}_ranges"] for name in SCANS}
-        return _asked(halves, per_set, key)
-    return _asked(_offices(len(SCANS), per_set), per_set, key, generated=True)
+        return _asked(halves, per_set, key, displacement)
+    offices = _offices(len(SCANS), per_set)
+    return _asked(offices, per_set, key, displacement, generated=True)
 
 
 def laserazos(options: Options, key: int = 1, worlds: int | None = None) -> Asked:
@@ -92,7 +99,11 @@ def _offices(count: int, scans: int) -> dict[str, np.ndarray]:
 
 
 def _asked(
-    halves: dict[str, np.ndarray], per_set: int, key: int, generated: bool = False
+    halves: dict[str, np.ndarray],
+    per_set: int,
+    key: int,
+    displacement: tuple[float, float] = DISPLACEMENTS[-1],
+    generated: bool = False,
 ) -> Asked:
     """One case in each world."""
     outlines, poses = [], []
@@ -101,9 +112,8 @@ def _asked(
         again = np.arange(per_set) % len(closed.poses)
         outlines.append(closed.outlines[again])
         poses.append(closed.poses[again])
-    drawn = draw_cases(
-        jax.random.key(key), np.concatenate(outlines), np.concatenate(poses)
-    )
+    worlds = np.concatenate(outlines), np.concatenate(poses)
+    drawn = draw_cases(jax.random.key(key), *worlds, *displacement)
     sets = np.repeat(np.arange(len(halves)), per_set)
     return Asked(drawn, sets, tuple(halves), generated)
 

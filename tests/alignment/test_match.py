@@ -219,7 +219,7 @@ def test_what_cannot_be_matched_is_refused_in_words():
     few = Scan.from_ranges([2.0] * 9 + [np.inf] * 111, -np.pi, 2 * np.pi / RAYS)
     with refused("scan 0 has 9 echoes, but it takes at least 10"):
         match_room(scan=few)
-    with refused("match one"):
+    with refused("take many scans, the others one"):
         match_batch(ROOM, scan, NEAR)
     with refused("shape \\(2, 3\\) for 2 scans, got \\(3, 3\\)"):
         match_batch(ROOM, stack([scan, scan]), np.tile(NEAR, (3, 1)))

@@ -1,0 +1,1 @@
+"""Scan against scan, section by section (`reproduce_fsm.py`)."""
