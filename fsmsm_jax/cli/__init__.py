@@ -1,11 +1,11 @@
-"""The command line: `fsmsm localise MAP LOG`, `match`, `track`, and `demo` as a taste.
+"""The command line: `fsmsm localise MAP LOG`, `match`, `track`, `odometry`, and `demo`.
 
 All end in a picture. `localise` reads a map_server map and one scan of a log (rosbag,
 CARMEN or .npz) and says where it was taken, how surely, and what else it could have
 been; `match` says so more quickly where a first estimate is at hand; `track` follows
-the lidar through a whole log. `--json` says it to a program. Text and JSON go to
-stdout, progress to stderr. An error is one line on stderr and exit status 2; Ctrl-C is
-exit status 130.
+the lidar through a whole log; `odometry` says how it moved, from a log without any map.
+`--json` says it to a program. Text and JSON go to stdout, progress to stderr. An error
+is one line on stderr and exit status 2; Ctrl-C is exit status 130.
 
 Compiled programs are kept in $XDG_CACHE_HOME/fsmsm_jax (~/.cache/fsmsm_jax), which
 takes seconds off every run but the first; FSMSM_NO_CACHE=1 turns that off, and
@@ -23,9 +23,10 @@ import tyro
 from fsmsm_jax.cli.localise import localise
 from fsmsm_jax.cli.match import match
 from fsmsm_jax.cli.track import track
+from fsmsm_jax.cli.odometry import odometry
 from fsmsm_jax.cli.demo import demo
 
-__all__ = ["demo", "localise", "main", "match", "track"]
+__all__ = ["demo", "localise", "main", "match", "odometry", "track"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,7 +34,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _keep_compiled_programs()
         tyro.extras.subcommand_cli_from_dict(
-            {"localise": localise, "match": match, "track": track, "demo": demo},
+            {
+                "localise": localise,
+                "match": match,
+                "track": track,
+                "odometry": odometry,
+                "demo": demo,
+            },
             prog="fsmsm",
             description="Where is my lidar? 2D lidar localisation against a map.",
             args=arguments,

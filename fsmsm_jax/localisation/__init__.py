@@ -52,3 +52,11 @@ from fsmsm_jax.localisation.pgl_fmic import (
     PglFmicConfig as PglFmicConfig,
     pgl_fmic as pgl_fmic,
 )
+from fsmsm_jax.localisation import odometer as odometer
+from fsmsm_jax.localisation.odometer import (
+    LidarOdometryConfig as LidarOdometryConfig,
+)
+from fsmsm_jax.localisation.lidar_odometry import (
+    LidarOdometry as LidarOdometry,
+    lidar_odometry as lidar_odometry,
+)
