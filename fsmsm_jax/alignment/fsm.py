@@ -35,7 +35,7 @@ from fsmsm_jax.sensing import Scan, closed_outline, panorama, raycast, seen_spac
 __all__ = ["fast_fsm", "fsm", "match_scans", "match_scans_batch"]
 
 _AGREEING, _NOISES = 0.1, 4.0  # [m], or so many σ of the difference: off, or not
-_MOST = 0.75  # share of the common rays that agree if the answer is right
+_MOST = 0.8  # share of the common rays that agree if the answer is right
 _COMMON = 0.25  # share of the echoes that must be common
 
 
@@ -84,7 +84,7 @@ def match_scans(
     Returns:
         The pose of `scan`'s sensor in the frame of the reference's, its covariance, and
         what to think of it. The CAER is that of the rays that both have seen. Where
-        less than a quarter of the echoes is common, less than 75 % of these agree (to
+        less than a quarter of the echoes is common, less than 80 % of these agree (to
         0.1 m, or four times the noise), or they agree no better than at the guess,
         `converged` is False and the guess is given back, with the covariance of a pose
         anywhere in the box.

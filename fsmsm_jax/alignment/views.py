@@ -15,6 +15,7 @@ Gauss-Newton step: an interpolated ray has less noise than a measured one, so th
 half views of one thing are better than one.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -35,6 +36,8 @@ _FARTHEST = 1e-4  # [1/m] least inverse range between two rays
 # A point between two rays has, on average, two thirds of a ray's variance: residuals
 # show 1 + 2/3 of it where two scans have 2.
 _INTERPOLATED = 2 / (1 + 2 / 3)
+_MERE_NOISE = 8.0  # times the information that noise alone would feign is taken off
+_LEAST = 1e-4  # of the information is left, if noise might be all of it
 _SLOPES = 1.45  # variance over that of a fit with exact slopes, at all levels of noise
 _FLOOR = 0.005  # [m] least noise of a range that a covariance believes in
 
@@ -58,7 +61,12 @@ class View(NamedTuple):
 
 def view_residuals(
     reference: View, scan: Scan, pose: Float[Array, "3"]
-) -> tuple[Float[Array, "rays"], Float[Array, "rays 3"], Bool[Array, "rays"]]:
+) -> tuple[
+    Float[Array, "rays"],
+    Float[Array, "rays 3"],
+    Float[Array, "rays 3"],
+    Bool[Array, "rays"],
+]:
     """How far the scan's end points are from the reference's walls, along its rays.
 
     Args:
@@ -67,8 +75,8 @@ def view_residuals(
         pose: of the scan's sensor in the frame of the reference's [m, m, rad].
 
     Returns:
-        Residuals e [m], −∂e/∂(x, y, θ), and which of the end points lie where the
-        reference has seen a wall.
+        Residuals e [m]; J = −∂e/∂(x, y, θ); how far J is off if the wall's slope is by
+        one standard deviation; which end points lie where the reference saw a wall.
     """
     ranges, walls = reference.panorama.ranges, reference.walls
     rays = ranges.size
@@ -85,14 +93,16 @@ def view_residuals(
 
     # Between two rays runs the chord: 1/r is a sum of sines, as for any straight wall.
     near, far = jnp.sin((1 - t) * spacing), jnp.sin(t * spacing)
-    inverse = mixed(1 / jnp.maximum(ranges, _TINY), near, far) / np.sin(spacing)
+    inverse = mixed(1 / jnp.maximum(ranges, _TINY), near, far) / math.sin(spacing)
     e = 1 / jnp.maximum(inverse, _FARTHEST) - away
 
     bend = mixed(walls.slope / jnp.maximum(walls.ranges, _TINY), 1 - t, t)
+    unsure = walls.noise * jnp.sqrt(walls.slope_share[before]) / away
     ux, uy = x / away, y / away
-    gx, gy = ux + bend * uy, uy - bend * ux
-    turn = gy * (x - pose[0]) - gx * (y - pose[1])
-    return e, jnp.stack([gx, gy, turn], axis=-1), scan.echo & walls.solid[before]
+    rx, ry = x - pose[0], y - pose[1]
+    row = lambda gx, gy: jnp.stack([gx, gy, gy * rx - gx * ry], axis=-1)
+    J, doubt = row(ux + bend * uy, uy - bend * ux), row(unsure * uy, -unsure * ux)
+    return e, J, doubt, scan.echo & walls.solid[before]
 
 
 def fit_views(
@@ -117,7 +127,7 @@ def fit_views(
     """
 
     def step(now, _):
-        e, J, w = _weighed(reference, view, now)
+        e, J, _, w = _weighed(reference, view, now)
         after = gauss_newton_step(now, e, J, w, 1e-6)
         near = jnp.clip(after[:2], pose[:2] - reach, pose[:2] + reach)
         return after.at[:2].set(near), None
@@ -127,15 +137,15 @@ def fit_views(
 
 def _weighed(reference, view, pose):
     """Residuals of each scan on the other, and how much each of them counts."""
-    e, J, known = view_residuals(reference, view.scan, pose)
     back = geometry.inverse(pose)
-    e_back, J_back, known_back = view_residuals(view, reference.scan, back)
-    e = jnp.concatenate([e, e_back])
-    known = jnp.concatenate([known, known_back])
-    J = jnp.concatenate([J, J_back @ jax.jacfwd(geometry.inverse)(pose)])
+    one = view_residuals(reference, view.scan, pose)
+    other = view_residuals(view, reference.scan, back)
+    by_pose = jax.jacfwd(geometry.inverse)(pose)
+    e, known = (jnp.concatenate([one[k], other[k]]) for k in (0, 3))
+    J, doubt = (jnp.concatenate([one[k], other[k] @ by_pose]) for k in (1, 2))
     e = jnp.where(known, e, 0.0)
     width = _KERNEL * scale_of(e, known) + _TINY
-    return e, J, jnp.where(known, geman_mcclure(e, width), 0.0)
+    return e, J, doubt, jnp.where(known, geman_mcclure(e, width), 0.0)
 
 
 def view_covariance(
@@ -148,13 +158,21 @@ def view_covariance(
     as the residuals show it, made up for the part of it that interpolation removes. The
     walls' slopes are estimates, too, and edges belong to no wall: on the worlds of the
     thesis the poses scatter by 1.45 times that variance, for every noise from 0.01 to
-    0.2 m, and the covariance is larger by as much.
+    0.2 m, and the covariance is larger by as much. In a direction that nothing measures
+    noise of the slopes looks like information; eight times of what is expected of it is
+    taken off: slopes of neighbours err alike.
 
     Returns:
         The covariance, positive definite. What no ray measures has (10 m)² or (π rad)².
     """
-    e, J, w = _weighed(reference, view, pose)
+    e, J, doubt, w = _weighed(reference, view, pose)
     v = jnp.sum(w**2 * e**2) / jnp.maximum(jnp.sum(w**2), 1e-6)
     v = _SLOPES * jnp.maximum(v * _INTERPOLATED, 2 * _FLOOR**2)
-    H, _ = inverse_root(J * jnp.sqrt(w / (2 * v))[:, None])
+    count = jnp.sqrt(w / (2 * v))[:, None]
+    H, _ = inverse_root(J * count)
+    feigned = doubt * count @ H
+    left, axes = jnp.linalg.eigh(
+        jnp.eye(3, dtype=H.dtype) - _MERE_NOISE * feigned.T @ feigned
+    )
+    H = H @ axes / jnp.sqrt(jnp.maximum(left, _LEAST))[None]
     return definite(H @ H.T)

@@ -37,7 +37,7 @@ def seen_space(panorama: Scan, walls: Surfaces | None = None) -> PolygonMap:
         >>> ahead = Scan.from_ranges(np.full(181, 2.0), -np.pi / 2, np.pi / 180)
         >>> world = seen_space(panorama(ahead, 360))
         >>> ranges = raycast(world, jnp.array([-0.5, 0.0, 0.0]), jnp.array([0.0, 3.0]))
-        >>> ranges.round(3).tolist()  # the wall ahead; behind, nobody knows
+        >>> ranges.round(2).tolist()  # the wall ahead; behind, nobody knows
         [2.5, 30.0]
     """
     walls = surfaces(panorama) if walls is None else walls

@@ -44,8 +44,8 @@ def raycast(
         world: an `OccupancyGrid` or a `PolygonMap`.
         pose: [x, y, θ] of the sensor in the map frame [m, m, rad].
         bearings: directions of the rays in the sensor frame [rad].
-        range_max: cap [m]; rays that meet nothing nearer, or a veil of a polygon first,
-            read exactly this. A pose outside a grid sees nothing.
+        range_max: cap [m]; rays that meet nothing nearer, or first the front of a
+            polygon's veil, read exactly this. A pose outside a grid sees nothing.
 
     Returns:
         One range [m] per bearing, in [0, range_max].
@@ -121,6 +121,8 @@ def _hit_segments(world, position, headings, range_max):
     )
     area = ax * by - ay * bx
     inverse = jnp.where(area == 0, 0.0, 1 / jnp.where(area == 0, 1.0, area))
+    if world.solid is not None:  # from behind, a veil hides nothing
+        inverse = jnp.where(world.solid | (area > 0), inverse, 0.0)
     w = jnp.stack([by - ay, ax - bx]) * inverse[None]
     count = w.shape[1]
     walls = jnp.stack([ax, ay, bx, by, *w, jnp.arange(count, dtype=w.dtype)])

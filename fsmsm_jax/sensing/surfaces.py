@@ -14,6 +14,7 @@ is believed: a long one on a wall, a one-sided one beside an edge, and beside a 
 none, which leaves the ray as it was measured.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -43,6 +44,9 @@ class Surfaces(NamedTuple):
     """Its slope dr/dφ [m/rad]; 0 where none was made out."""
     share: Float[Array, "rays"]
     """Variance that is left of a ray's noise: 1/n after a window of n rays, or 1."""
+    slope_share: Float[Array, "rays"]
+    """Variance of the slope over that of a range [1/rad²]; 0 where none was made
+    out."""
     solid: Bool[Array, "rays"]
     """Whether something stands all the way from ray n to ray n + 1: both are echoes,
     and no jump is between them."""
@@ -74,12 +78,13 @@ def surfaces(panorama: Scan) -> Surfaces:
     ranges, echo = panorama.ranges, panorama.echo
     spacing = 2 * np.pi / ranges.size
     noise = _noise(ranges, echo)
-    smooth, slope, share = _best_fits(ranges, echo, noise, spacing)
+    smooth, slope, share, slope_share = _best_fits(ranges, echo, noise, spacing)
     following = jnp.roll(smooth, -1)
     # What a wall seen at 75° from its normal might step, and what noise might.
     step = _STEEPEST * spacing * jnp.minimum(smooth, following)
     near = jnp.abs(following - smooth) <= step + _JUMP * noise
-    return Surfaces(smooth, slope, share, near & echo & jnp.roll(echo, -1), noise)
+    solid = near & echo & jnp.roll(echo, -1)
+    return Surfaces(smooth, slope, share, slope_share, solid, noise)
 
 
 def _noise(ranges, echo):
@@ -88,11 +93,11 @@ def _noise(ranges, echo):
     known = echo & jnp.roll(echo, 1) & jnp.roll(echo, -1)
     middle = jnp.nanmedian(jnp.where(known, jnp.abs(second), jnp.nan))
     middle = jnp.where(jnp.any(known), middle, 0.0)
-    return jnp.maximum(1.4826 * middle / np.sqrt(1.5), _FINEST)
+    return jnp.maximum(1.4826 * middle / math.sqrt(1.5), _FINEST)
 
 
 def _best_fits(ranges, echo, noise, spacing):
-    """Range, slope and variance share of each ray, by the best window it is in."""
+    """Range, slope and the shares of each ray, by the best window it is in."""
     # Weights and inverse ranges from the middle of five: it keeps edges, and does not
     # follow the ray's own noise, which would pull the fit to where it is small.
     middle = jnp.maximum(_median_of_five(ranges), _NEAREST)
@@ -111,7 +116,7 @@ def _best_fits(ranges, echo, noise, spacing):
     width = windows.sum(axis=1)[:, None]
     misfit = (yy - a * yc - b * ys) / (width - 2)
     allowed = noise**2 * (1 + _BEYOND * np.sqrt(2 / (width - 2)))
-    allowed += (_ROUNDING * middle) ** 2
+    allowed = allowed + (_ROUNDING * middle[None]) ** 2
     inside = total(1.0, echo.astype(ranges.dtype)) >= width - 0.5
     sound = inside & (misfit <= allowed) & (a > _NARROW)
     a = jnp.where(sound, a, 1.0)
@@ -123,6 +128,7 @@ def _best_fits(ranges, echo, noise, spacing):
         jnp.where(made_out, take(1 / a), ranges),
         jnp.where(made_out, take(-b / a**2), 0.0),
         jnp.where(made_out, take(share), 1.0),
+        jnp.where(made_out, take(cc / det / a**4), 0.0),
     )
 
 

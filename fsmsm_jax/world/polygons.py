@@ -29,7 +29,8 @@ class PolygonMap(eqx.Module):
     """Second end of each wall, map frame [m]."""
     solid: Bool[Array, "segments"] | None = None
     """Which segments are walls and not veils; all, if None. A ray that meets a veil
-    first reads `range_max`, as one that meets nothing."""
+    first, coming from its left, reads `range_max`, as one that meets nothing. From its
+    right it passes: in a counter-clockwise outline, into what was seen."""
 
     @classmethod
     def from_outlines(cls, *outlines: Sequence | np.ndarray | Array) -> "PolygonMap":

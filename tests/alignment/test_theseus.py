@@ -260,3 +260,35 @@ def test_distinct_headings_finds_all_four_of_a_square_and_only_those_allowed():
     allowed = distinct_headings(real, fine, 0.0, 0.7, 4, 0.5)
     assert np.abs(allowed.corrections - 0.3).min() <= half_a_ray + 1e-5
     assert np.abs(allowed.corrections).max() <= 0.7
+
+
+def test_rays_that_know_nothing_do_not_vote_on_the_heading(pair):
+    """`fine_mask` against a comparison ray by ray, heading by heading."""
+    real, fine = pair
+    rng = np.random.default_rng(0)
+    mask = np.ones(RAYS, bool)
+    mask[40:130] = False
+    known = np.repeat(rng.uniform(size=72) < 0.7, 40)  # runs of five whole rays
+    spoilt = np.where(known, fine, rng.uniform(1, 30, fine.size))
+    found = distinct_headings(
+        jnp.where(mask, real, 30.0),
+        jnp.asarray(spoilt, real.dtype),
+        0.934,
+        0.6,
+        3,
+        0.05,
+        jnp.asarray(mask),
+        jnp.asarray(known),
+    )
+    logs = np.log(np.asarray(real, float) + 0.3), np.log(spoilt + 0.3)
+    turns = difference(np.arange(fine.size) * GAMMA / 8, 0)
+    costs = np.full(fine.size, np.inf)
+    for k in np.flatnonzero(np.abs(difference(turns, 0.934)) <= 0.6):
+        at = (np.arange(RAYS) * 8 + k) % fine.size
+        both = mask & known[at]
+        costs[k] = np.mean((logs[0] - logs[1][at])[both] ** 2)
+    best = int(np.argmin(costs))
+    np.testing.assert_allclose(found.corrections[0], turns[best], atol=1e-5)
+    # Sums of 360 squares of logarithms by FFT: 1e-5 of their size.
+    np.testing.assert_allclose(found.caer[0], costs[best], atol=1e-4)
+    assert abs(difference(turns[best], 0.934)) <= GAMMA / 8

@@ -120,6 +120,32 @@ def test_polygons_have_no_gaps_between_walls():
         assert cast(world, POSE, bearings, 50.0).max() < 50
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_veils_hide_what_is_behind_them(seed):
+    """Against one ray at a time: of all the walls and veils, what comes first?
+
+    A veil stops who comes from its left, where the space is that was seen, and lets in
+    who comes from its right.
+    """
+    room = star(seed, corners=40)
+    solid = np.random.default_rng(seed).uniform(size=40) < 0.7
+    world = PolygonMap(room.start, room.end, jnp.asarray(solid))
+    start, end = np.asarray(room.start, float), np.asarray(room.end, float)
+    for pose in (POSE, POSE + jnp.array([7.0, 2.0, 0.0])):  # in the room, and without
+        position, headings = np.asarray(pose[:2], float), np.asarray(pose[2] + BEARINGS)
+        a, b = start - position, end - position
+        left = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
+        met = solid | left
+        ranges = cast_walls(start[met], end[met], position, headings, 30.0)
+        walls = cast_walls(start[solid], end[solid], position, headings, 30.0)
+        expected = np.where(np.isclose(ranges, walls), walls, 30.0)
+        assert 0.02 < np.mean(expected < 30) < 0.98
+        found = np.asarray(cast(world, pose, BEARINGS))
+        assert np.mean(np.abs(found - expected) > 1e-3) < 0.02  # corners, as above
+        derivative = np.asarray(by_pose(world, pose, BEARINGS))
+        np.testing.assert_array_equal(derivative[found == 30], 0)
+
+
 def test_yaw_of_the_origin_turns_the_map():
     cells = np.pad(np.asarray(random_grid(5).cells), 1, constant_values=100)
     flat = OccupancyGrid.from_cells(cells, 0.05, (3.0, -8.0, 0.0))

@@ -1,3 +1,5 @@
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -29,3 +31,20 @@ def test_outlines_close_and_join():
 def test_bad_outlines_are_refused(outlines, message):
     with pytest.raises(ValueError, match=message):
         PolygonMap.from_outlines(*outlines)
+
+
+def test_veils_are_no_walls_to_measure_distance_from():
+    room = PolygonMap.from_outlines(ROOM)
+    assert room.solid is None
+    points = jnp.array([[13.0, 21.5], [14.8, 23.0], [11.1, 24.3]])
+    np.testing.assert_allclose(room.distance_at(points), [0.5, 0.2, 0.1], atol=1e-5)
+    # Without the floor (the first segment), the others are as near as they were.
+    solid = jnp.array([False, True, True, True])
+    veiled = eqx.tree_at(
+        lambda w: w.solid, room, solid, is_leaf=lambda leaf: leaf is None
+    )
+    np.testing.assert_allclose(veiled.distance_at(points), [2.0, 0.2, 0.1], atol=1e-5)
+    np.testing.assert_array_equal(veiled.contains(points), True)
+    nothing = eqx.tree_at(lambda w: w.solid, veiled, jnp.zeros(4, bool))
+    np.testing.assert_array_equal(nothing.distance_at(points), np.inf)
+    np.testing.assert_allclose(veiled.distance_at(points[0]), 2.0, atol=1e-5)
