@@ -1,5 +1,6 @@
 """Pairs of scans to match, the two ways to do it, and how long they take."""
 
+import dataclasses
 import time
 from typing import NamedTuple
 
@@ -7,21 +8,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fsmsm_jax.alignment import FsmsmConfig, fsm, match_scans_batch
+from fsmsm_jax.alignment import FastConfig, FsmsmConfig, fsm, match_scans_batch
 from fsmsm_jax.evaluation import FARTHEST, Cases, noisy, scan_to_scan
 from fsmsm_jax.sensing import Scan
 
 FAST, FAITHFUL = "fast", "FSM"
 WAYS = (FAST, FAITHFUL)
 _KEY = jax.random.key(0)  # of recoveries
+_STRAY = 1.5  # boxes: their corners, whichever way the sensor is turned
+
+PROGRAM = {FAST: FastConfig(stray=_STRAY), FAITHFUL: FsmsmConfig.scan_to_scan()}
+"""By us, and as the thesis's program was run by others: I_T = 2 (1 + ν)."""
 
 
-def _match(way: str, references: Scan, scans: Scan, guesses: jax.Array):
-    """By us, or as the thesis does: without a guard, for the same answers as its."""
+def of_the_thesis(box: tuple[float, float]) -> dict[str, FastConfig | FsmsmConfig]:
+    """As in its evaluation: I_T = 5 (1 + ν), and all are told the displacement's box."""
+    faithful = dataclasses.replace(FsmsmConfig.scan_to_scan(5), box=box, stray=_STRAY)
+    return {
+        FAST: FastConfig(stray=_STRAY, box=(box[0], box[1])),
+        FAITHFUL: faithful,
+    }
+
+
+def _match(config, references: Scan, scans: Scan, guesses: jax.Array):
+    """The thesis's without a verdict, which it has not, for the same answers as its."""
     rays = scans.ranges.shape[1]
-    if way == FAST:
-        return match_scans_batch(references, scans, guesses, rays=rays)
-    config = FsmsmConfig.scan_to_scan()
+    if isinstance(config, FastConfig):
+        return match_scans_batch(references, scans, guesses, config, rays=rays)
     return fsm(references, scans, guesses, config, rays, _KEY)
 
 
@@ -62,10 +75,10 @@ def _scans(ranges: jax.Array) -> Scan:
     return Scan(ranges, around, ones, ones, jnp.full(count, FARTHEST))
 
 
-def answers(pairs: Pairs, way: str, again: int = 1) -> Answers:
+def answers(pairs: Pairs, config: FastConfig | FsmsmConfig, again: int = 1) -> Answers:
     """Match them, and once more to take the time."""
     given = pairs.references, pairs.scans, pairs.guesses
-    call = lambda: jax.block_until_ready(_match(way, *given))
+    call = lambda: jax.block_until_ready(_match(config, *given))
     found, seconds = call(), []
     for _ in range(again):
         begun = time.perf_counter()

@@ -9,7 +9,7 @@ import numpy as np
 from thesis.report import Table, interval, number, pair
 from thesis.worlds import Options, five_sets, progress
 
-from fsm.pairs import WAYS, answers, pairs_of
+from fsm.pairs import PROGRAM, WAYS, answers, pairs_of
 from fsmsm_jax.evaluation import mean_of, published_cases
 
 
@@ -25,7 +25,7 @@ def golden(options: Options) -> Iterator[Table]:
         cpp_position, cpp_turn, cpp_seconds = theirs[sigma]
         for way in WAYS:
             progress(f"golden: {way}, σ {sigma:g}")
-            ours = answers(pairs, way, again=3)
+            ours = answers(pairs, PROGRAM[way], again=3)
             near = np.abs(ours.position - cpp_position) < 1e-3
             middle = lambda e: pair((np.median(e), np.mean(e)), 1e3)
             rows.append(
@@ -98,8 +98,8 @@ def times(options: Options) -> Iterator[Table]:
     rows = []
     for way in WAYS:
         alone = jax.tree.map(lambda a: a[:1], pairs)
-        ones = answers(alone, way, again=3 if options.quick else 50)
-        many = answers(pairs, way, again=1 if options.quick else 5)
+        ones = answers(alone, PROGRAM[way], again=3 if options.quick else 50)
+        many = answers(pairs, PROGRAM[way], again=1 if options.quick else 5)
         rows.append((way, number(1e3 * ones.seconds), number(1e3 * many.seconds)))
     yield Table(
         "Milliseconds a match, alone and together",
