@@ -36,7 +36,7 @@ _FARTHEST = 1e-4  # [1/m] least inverse range between two rays
 # A point between two rays has, on average, two thirds of a ray's variance: residuals
 # show 1 + 2/3 of it where two scans have 2.
 _INTERPOLATED = 2 / (1 + 2 / 3)
-_MERE_NOISE = 8.0  # times the information that noise alone would feign is taken off
+_MERE_NOISE = 3.0  # times the information that noise alone would feign is taken off
 _LEAST = 1e-4  # of the information is left, if noise might be all of it
 _SLOPES = 1.45  # variance over that of a fit with exact slopes, at all levels of noise
 _FLOOR = 0.005  # [m] least noise of a range that a covariance believes in
@@ -159,7 +159,7 @@ def view_covariance(
     walls' slopes are estimates, too, and edges belong to no wall: on the worlds of the
     thesis the poses scatter by 1.45 times that variance, for every noise from 0.01 to
     0.2 m, and the covariance is larger by as much. In a direction that nothing measures
-    noise of the slopes looks like information; eight times of what is expected of it is
+    noise of the slopes looks like information; three times of what is expected of it is
     taken off: slopes of neighbours err alike.
 
     Returns:

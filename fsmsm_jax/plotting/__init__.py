@@ -1,8 +1,9 @@
 """Pictures: each function draws one thing on an Axes that you bring, and returns it.
 
-`localisation` shows one answer on its map; `thesis` shows what many answers are worth:
-the figures of the published evaluation, with the published numbers on them; `basins`
-from how far off a matcher still finds home; `tracking` the way of a robot.
+`localisation` shows one answer on its map, `scans` the space that one scan saw;
+`thesis` shows what many answers are worth: the figures of the published evaluation,
+with the published numbers on them; `basins` from how far off a matcher still finds
+home; `tracking` the way of a robot, `odometry` the way that scans alone tell.
 
 Import this package by its name; `import fsmsm_jax` alone does not load matplotlib.
 """
@@ -20,6 +21,10 @@ from fsmsm_jax.plotting.localisation import (
     plot_scan as plot_scan,
     plot_world as plot_world,
 )
+from fsmsm_jax.plotting.scans import (
+    SeenSpaceArtists as SeenSpaceArtists,
+    plot_seen_space as plot_seen_space,
+)
 from fsmsm_jax.plotting.thesis import (
     plot_caer as plot_caer,
     plot_convergence as plot_convergence,
@@ -34,3 +39,4 @@ from fsmsm_jax.plotting.tracking import (
     plot_particles as plot_particles,
     plot_track as plot_track,
 )
+from fsmsm_jax.plotting.odometry import plot_odometry as plot_odometry

@@ -28,7 +28,10 @@ __all__ = ["Surfaces", "surfaces"]
 _WIDEST = 20  # the longest window reaches a twentieth of the circle to either side
 _BEYOND = 2.0  # standard errors by which a window may fit worse than the noise
 _ROUNDING = 1e-3  # of the range: a fit may be off by this, which float32 cannot tell
-_FINEST = 5e-4  # [m] least noise: rounding, and what no lidar reaches
+_FINEST, _COARSEST = 5e-4, 0.3  # [m] noise: less is rounding, more is no lidar's
+_MEDIAN = 0.67449 * math.sqrt(1.5)  # of |second differences|, for noise of variance 1
+_QUARTILE = 0.31864 * math.sqrt(1.5)
+_AGREED = 1.5  # times what the quartile says is the most that the median may
 _NARROW = 1e-3  # [1/m] least inverse range of a fit: farther than a kilometre is none
 _NEAREST = 0.01  # [m] least range that is inverted
 _STEEPEST = 3.7  # tan 75°, as for `panorama`
@@ -88,12 +91,17 @@ def surfaces(panorama: Scan) -> Surfaces:
 
 
 def _noise(ranges, echo):
-    """From second differences, which no straight and hardly any other wall has."""
-    second = ranges - 0.5 * (jnp.roll(ranges, 1) + jnp.roll(ranges, -1))
+    """From second differences, which no straight and hardly any other wall has.
+
+    Their median tells best, but in clutter, where half of the rays jump, it tells of
+    jumps; their quartile, of rays that still lie on walls, shows that.
+    """
+    second = jnp.abs(ranges - 0.5 * (jnp.roll(ranges, 1) + jnp.roll(ranges, -1)))
     known = echo & jnp.roll(echo, 1) & jnp.roll(echo, -1)
-    middle = jnp.nanmedian(jnp.where(known, jnp.abs(second), jnp.nan))
-    middle = jnp.where(jnp.any(known), middle, 0.0)
-    return jnp.maximum(1.4826 * middle / math.sqrt(1.5), _FINEST)
+    rising, count = jnp.sort(jnp.where(known, second, jnp.inf)), jnp.sum(known)
+    median, quartile = rising[count // 2], rising[count // 4]
+    noise = jnp.minimum(median / _MEDIAN, _AGREED * quartile / _QUARTILE)
+    return jnp.clip(jnp.where(count > 0, noise, 0.0), _FINEST, _COARSEST)
 
 
 def _best_fits(ranges, echo, noise, spacing):
