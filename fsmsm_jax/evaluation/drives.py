@@ -132,7 +132,7 @@ def _followed(way, speed, turn_rate, rate_hz, heading):
         travelled = ahead[np.argmin(np.hypot(here[0] - x, here[1] - y))]
         aim = min(travelled + _AHEAD, corner_at[-1])
         to = [np.interp(aim, corner_at, way[:, i]) - at for i, at in ((0, x), (1, y))]
-        distance = math.hypot(*to)
+        distance = max(math.hypot(*to), 1e-9)
         if aim == corner_at[-1] and distance < close:
             poses.append((x, y, heading))
             break
