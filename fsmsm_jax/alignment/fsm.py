@@ -37,6 +37,7 @@ __all__ = ["fast_fsm", "fsm", "match_scans", "match_scans_batch"]
 _AGREEING, _NOISES = 0.1, 4.0  # [m], or so many σ of the difference: off, or not
 _MOST = 0.8  # share of the common rays that agree if the answer is right
 _COMMON = 0.25  # share of the echoes that must be common
+_EVEN = 0.02  # of the rays: a sensor at rest agrees with its guess as well as ever
 
 
 def fast_fsm(
@@ -230,7 +231,10 @@ def _match(jobs, config, rays):
         reference, view = View.of(reference, rays), View.of(scan, rays)
         if isinstance(config, FastConfig):
             pose = fast_fsm(reference, view, guess, config)
-            steps, scans = 1 + config.looks + config.finish, 1 + config.kept
+            steps, scans = (
+                1 + config.looks + config.finish,
+                1 + config.kept * config.looks,
+            )
             learned = ~strayed(config, pose, guess)
         else:
             pose, learned = found.pose, found.converged
@@ -238,7 +242,9 @@ def _match(jobs, config, rays):
         compare = lambda pose: _compare(reference, view, pose)
         caers, agreements, common = jax.vmap(compare)(jnp.stack([guess, pose]))
         learned &= (common[1] >= _COMMON) & (agreements[1] >= _MOST)
-        learned &= agreements[1] >= agreements[0] * (common[0] >= common[1])
+        # Not if the guess, from which no less is common, agrees better already.
+        gained = agreements[1] - agreements[0] >= -_EVEN
+        learned &= gained | (common[1] > common[0])
         spread = view_covariance(reference, view, pose)
         half = jnp.stack([config.box[0], *config.box]).astype(pose.dtype)
         chosen = learned.astype(int)

@@ -187,6 +187,14 @@ def test_both_methods_agree_on_panoramas_without_noise():
     assert np.median(turn) < 2 * np.pi / RAYS / 8
 
 
+def test_a_sensor_at_rest_is_believed():
+    """The guess is the answer, and noise may let it agree with a ray more."""
+    rest = jnp.zeros((PAIRS, 3))
+    found = match_scans_batch(*pairs_in(l_room(), rest, 0.03), HERE)
+    assert found.converged.all()
+    assert np.max(np.hypot(*np.asarray(found.pose)[:, :2].T)) < 0.02
+
+
 def test_scans_without_a_common_view_are_refused():
     """What one sensor sees before it, the other has behind it."""
     truth = motions_in_the_box(1, 0.1)
