@@ -97,11 +97,10 @@ def speed(options: Options) -> Iterator[Table]:
     for name in (MAC, "intel", "freiburg-079"):
         recording = _load(options, name).upto(300 if options.quick else 2000)
         scans = recording.log.scans(range(len(recording.reference)))
-        go = lambda: jax.block_until_ready(odometer.run(odometer.init(), scans))  # noqa: B023
         times = []
         for _ in range(4):
             begun = time.perf_counter()
-            go()
+            jax.block_until_ready(odometer.run(odometer.init(), scans))
             times.append(time.perf_counter() - begun)
         count, rays = scans.ranges.shape
         best, middle = min(times[1:]), float(np.median(times[1:]))

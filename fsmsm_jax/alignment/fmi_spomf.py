@@ -120,8 +120,7 @@ def rotation_and_scale(
         config: settings, the same as for the spectra.
 
     Returns:
-        What is left when the shift does not matter. Of 190 pairs of photographs 99 %
-        were within 0.5° and 1 %, half within 0.02° and 0.14 %.
+        What is left when the shift does not matter; `fmi_spomf` is finer.
 
     Example:
         >>> r = jnp.zeros((64, 64)).at[20:30, 10:50].set(1.0)

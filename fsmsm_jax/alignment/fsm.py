@@ -86,7 +86,7 @@ def match_scans(
         The pose of `scan`'s sensor in the frame of the reference's, its covariance, and
         what to think of it. The CAER is that of the rays that both have seen. Where
         less than a quarter of the echoes is common, less than 80 % of these agree (to
-        0.1 m, or four times the noise), or they agree no better than at the guess,
+        0.1 m, or four times the noise), or they agree less than at the guess,
         `converged` is False and the guess is given back, with the covariance of a pose
         anywhere in the box.
 

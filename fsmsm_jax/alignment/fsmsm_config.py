@@ -124,8 +124,8 @@ class FsmsmConfig(eqx.Module):
 
         Args:
             translations: I_T(ν) = translations · (1 + ν) steps of the position law: 2
-                in the thesis's program, 5 in its text, which takes longer and ends in
-                the same place.
+                in the thesis's program as its defaults run it, 5 in its text, with
+                which its published table comes out (`scripts/reproduce_fsm.py`).
 
         Reference:
             Algorithm XXIV of the thesis and the defaults of its program (`fsm.h`).

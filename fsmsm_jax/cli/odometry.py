@@ -12,9 +12,15 @@ import tyro
 from jaxtyping import Float
 
 from fsmsm_jax.cli.console import pose_in_words, save_picture, timed
-from fsmsm_jax.cli.runs import circumstances, new_folder, write_json
+from fsmsm_jax.cli.runs import (
+    circumstances,
+    new_folder,
+    picture_path,
+    scan_times,
+    write_json,
+)
 from fsmsm_jax.evaluation.drift import LENGTHS, drift, way
-from fsmsm_jax.io.logs import ScanLog, read_scans
+from fsmsm_jax.io.logs import read_scans
 from fsmsm_jax.io.tum import read_tum, write_tum
 from fsmsm_jax.localisation.lidar_odometry import LidarOdometry, lidar_odometry
 from fsmsm_jax.localisation.odometer import LidarOdometryConfig
@@ -57,16 +63,11 @@ def odometry(
         ValueError: log or reference cannot be read; a folder is missing or full.
     """
     scans = read_scans(log, topic)
-    stamps, remarks = _times(scans)
+    stamps, remarks = scan_times(scans)
     truth = None if reference is None else _at_scans(stamps, reference)
-    picture = _picture(plot, out)
-    for path in (tum, picture):
-        if (
-            path is not None
-            and path.parent != out
-            and not path.absolute().parent.is_dir()
-        ):
-            raise ValueError(f"there is no folder {path.parent} for {path}")
+    picture = picture_path(plot, out, "odometry.png")
+    if tum and tum.parent != out and not tum.absolute().parent.is_dir():
+        raise ValueError(f"there is no folder {tum.parent} for {tum}")
     if out is not None:
         new_folder(out)
     config, readings = LidarOdometryConfig(), scans.scans()
@@ -101,17 +102,6 @@ def odometry(
             print(f"{name:10}{path}", file=sys.stderr if json else sys.stdout)
 
 
-def _times(log: ScanLog) -> tuple[Float[np.ndarray, "scans"], list[str]]:
-    """A time for each scan, and what is odd about the log, the times included."""
-    remarks = list(log.remarks)
-    if log.stamps is None:
-        remarks.append("the log has no times: the trajectory counts scans, from 0")
-        return np.arange(len(log), dtype=float), remarks
-    if none := int(np.sum(~np.isfinite(log.stamps))):
-        remarks.append(f"{none} of {len(log)} scans have no time: no trajectory there")
-    return log.stamps, remarks
-
-
 def _at_scans(
     stamps: Float[np.ndarray, "scans"], path: Path
 ) -> Float[np.ndarray, "scans 3"]:
@@ -140,15 +130,6 @@ def _at_scans(
     there = np.stack([np.interp(stamps, times, column) for column in poses.T], axis=1)
     there = np.where(exact[:, None], poses[nearest], there)
     return np.where(known[:, None], there, np.nan)
-
-
-def _picture(plot: Path | None, out: Path | None) -> Path | None:
-    """Where the picture goes, if there is to be one."""
-    if plot == Path("none"):
-        return None
-    if plot is None:
-        return Path("odometry.png") if out is None else out / "odometry.png"
-    return plot
 
 
 def _metrics(

@@ -30,11 +30,19 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
+from fsmsm_jax.io.logs import ScanLog
 from fsmsm_jax.io.tum import TumWriter
 from fsmsm_jax.localisation.follow import Fix
 from fsmsm_jax.localisation.track import Track
 
-__all__ = ["Run", "circumstances", "new_folder", "write_json"]
+__all__ = [
+    "Run",
+    "circumstances",
+    "new_folder",
+    "picture_path",
+    "scan_times",
+    "write_json",
+]
 
 _LEG = 0.1  # [m]: shorter ways are noise and do not add to the distance driven
 _STATUSES = get_args(Fix.__annotations__["status"])
@@ -202,6 +210,32 @@ def _compilations() -> Iterator[Callable[[], int]]:
         yield lambda: len(seen)
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def scan_times(log: ScanLog) -> tuple[Float[np.ndarray, "scans"], list[str]]:
+    """A time for each scan, and what is odd about the log, the times included."""
+    remarks = list(log.remarks)
+    if log.stamps is None:
+        remarks.append("the log has no times: the trajectory counts scans, from 0")
+        return np.arange(len(log), dtype=float), remarks
+    if none := int(np.sum(~np.isfinite(log.stamps))):
+        remarks.append(f"{none} of {len(log)} scans have no time: no trajectory there")
+    return log.stamps, remarks
+
+
+def picture_path(plot: Path | None, out: Path | None, name: str) -> Path | None:
+    """Where a run's picture goes, if there is to be one.
+
+    Raises:
+        ValueError: there is no such folder.
+    """
+    if plot == Path("none"):
+        return None
+    if plot is None:
+        return Path(name) if out is None else out / name
+    if plot.parent != out and not plot.absolute().parent.is_dir():
+        raise ValueError(f"there is no folder {plot.parent} for the picture {plot}")
+    return plot
 
 
 def new_folder(path: Path) -> None:

@@ -13,7 +13,14 @@ from jaxtyping import Float
 
 from fsmsm_jax.cli.console import area, pose_in_words, save_picture
 from fsmsm_jax.cli.localise import load_or_build_atlas
-from fsmsm_jax.cli.runs import Run, circumstances, new_folder, write_json
+from fsmsm_jax.cli.runs import (
+    Run,
+    circumstances,
+    new_folder,
+    picture_path,
+    scan_times,
+    write_json,
+)
 from fsmsm_jax.io.logs import ScanLog, read_scans
 from fsmsm_jax.localisation.follow import FollowConfig, follow
 from fsmsm_jax.localisation.track import stacked
@@ -76,8 +83,8 @@ def track(
     scans = read_scans(log, topic, odometry_topic)
     odometry = None if no_odometry else scans.odometry
     readings = stacked(scans.scans(), odometry, _moments(scans, sweep, odometry))
-    stamps, remarks = _times(scans)
-    picture = _picture(plot, out)
+    stamps, remarks = scan_times(scans)
+    picture = picture_path(plot, out, "track.png")
     if out is not None:
         new_folder(out)
     with Run(stamps, tum, out) as run:
@@ -153,28 +160,6 @@ def _moments(
         )
     times = log.reversed_sweep().ray_times if sweep == "reversed" else log.ray_times
     return moments(log.stamps, np.asarray(times))
-
-
-def _times(log: ScanLog) -> tuple[Float[np.ndarray, "scans"], list[str]]:
-    """A time for each scan, and what is odd about the log, the times included."""
-    remarks = list(log.remarks)
-    if log.stamps is None:
-        remarks.append("the log has no times: the trajectory counts scans, from 0")
-        return np.arange(len(log), dtype=float), remarks
-    if none := int(np.sum(~np.isfinite(log.stamps))):
-        remarks.append(f"{none} of {len(log)} scans have no time: no trajectory there")
-    return log.stamps, remarks
-
-
-def _picture(plot: Path | None, out: Path | None) -> Path | None:
-    """Where the picture goes, if there is to be one."""
-    if plot == Path("none"):
-        return None
-    if plot is None:
-        return Path("track.png") if out is None else out / "track.png"
-    if not plot.absolute().parent.is_dir():
-        raise ValueError(f"there is no folder {plot.parent} for the picture {plot}")
-    return plot
 
 
 def _contents(log: ScanLog, odometry: np.ndarray | None) -> str:

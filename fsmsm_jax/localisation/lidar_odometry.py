@@ -99,7 +99,7 @@ def lidar_odometry(
     for begin in range(0, shape[0], length):
         # The last block is filled up with its last scan: one program for all.
         rows = np.minimum(np.arange(begin, begin + length), shape[0] - 1)
-        block = jax.tree.map(lambda a: a[rows], scans)  # noqa: B023
+        block = jax.tree.map(lambda a, rows=rows: a[rows], scans)
         state, info = run(state, block, config)
         parts.append(jax.tree.map(np.asarray, info))
     found = jax.tree.map(lambda *a: np.concatenate(a)[: shape[0]], *parts)

@@ -64,8 +64,7 @@ class PglFmicConfig(eqx.Module):
     """How pictures are made and hypotheses are judged; |H| is the caller's."""
 
     size: int = eqx.field(static=True, default=128)
-    """N_G: pixels along a side of a picture; the thesis's 256 take three times as long
-    and are right no more often."""
+    """N_G: pixels along a side of a picture; the thesis has 256."""
     rays: int = eqx.field(static=True, default=720)
     """N_s: rays of a scan, as it is pictured."""
     move: str = eqx.field(static=True, default="shift")
@@ -87,8 +86,7 @@ class PglFmicConfig(eqx.Module):
     rounds: int = eqx.field(static=True, default=2)
     """How often: turn, move."""
     threshold: ScalarLike = 0.4
-    """Similarity from which an answer counts as converged; scans of another building
-    reach 0.3."""
+    """Similarity from which an answer counts as converged."""
 
     def __check_init__(self):
         """Refuse sizes that nothing can be drawn or chosen with."""

@@ -75,8 +75,7 @@ def surfaces(panorama: Scan) -> Surfaces:
         (True, True)
 
     Note:
-        Pure, for `vmap`; about as dear as two casts of the same rays. A wall that is
-        round is taken for short straight ones.
+        Pure, for `vmap`. A wall that is round is taken for short straight ones.
     """
     ranges, echo = panorama.ranges, panorama.echo
     spacing = 2 * np.pi / ranges.size

@@ -8,8 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fsmsm_jax.alignment import FastConfig, FsmsmConfig, fsm, match_scans_batch
-from fsmsm_jax.evaluation import FARTHEST, Cases, noisy, scan_to_scan
+from fsmsm_jax.alignment import (
+    FastConfig,
+    FsmsmConfig,
+    Match,
+    fsm,
+    match_scans_batch,
+)
+from fsmsm_jax.evaluation import FARTHEST, Cases, nees, noisy, scan_to_scan
 from fsmsm_jax.sensing import Scan
 
 FAST, FAITHFUL = "fast", "FSM"
@@ -55,6 +61,8 @@ class Answers(NamedTuple):
     orientation: np.ndarray
     """Errors [rad]."""
     converged: np.ndarray
+    nees: float
+    """Of the answers that converged, mean; NaN where no covariance is given."""
     seconds: float
     """For a match, all pairs in one call, compiling left out."""
 
@@ -86,9 +94,16 @@ def answers(pairs: Pairs, config: FastConfig | FsmsmConfig, again: int = 1) -> A
         seconds.append(time.perf_counter() - begun)
     off = np.asarray(found.pose - pairs.true, float)
     turn = np.abs(np.mod(off[:, 2] + np.pi, 2 * np.pi) - np.pi)
+    converged = np.asarray(found.converged)
+    honest = np.nan
+    if isinstance(found, Match):
+        honest = float(
+            np.mean(nees(found.pose, pairs.true, found.covariance)[converged])
+        )
     return Answers(
         np.hypot(off[:, 0], off[:, 1]),
         turn,
-        np.asarray(found.converged),
+        converged,
+        honest,
         float(np.median(seconds)) / len(turn),
     )

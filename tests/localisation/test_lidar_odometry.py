@@ -104,7 +104,7 @@ def test_steps_are_the_run_and_lanes_are_alone(driven):
     few = jax.tree.map(lambda a: a[:6], scans)
     state = odometer.init(SMALL)
     for n in range(6):
-        scan = jax.tree.map(lambda a: a[n], few)  # noqa: B023
+        scan = jax.tree.map(lambda a, n=n: a[n], few)
         state, info = odometer.step(state, scan, SMALL)
         # Programs differ in the order of sums: float32's rounding of some metres.
         np.testing.assert_allclose(info.pose, found.pose[n], atol=2e-4)
@@ -195,7 +195,7 @@ def test_residuals_are_nought_at_the_truth_and_fall_as_their_derivative(ask):
     ask = jax.jit(ask)
     frames = none_yet(3, 360)
     for n in range(2):
-        scan = jax.tree.map(lambda a: a[n], scans)  # noqa: B023
+        scan = jax.tree.map(lambda a, n=n: a[n], scans)
         frames = keep(frames, scan, poses[n])
     last = jax.tree.map(lambda a: a[2], scans)
     e, J, known = ask(frames, last, poses[2])
