@@ -11,6 +11,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "fsmsm_jax"
 FLOORS = {
     "geometry": 0,
+    "resampling": 1,
     "world": 1,
     "sensing": 2,
     "alignment": 3,

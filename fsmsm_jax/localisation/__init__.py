@@ -22,7 +22,7 @@ from fsmsm_jax.localisation.follow import (
     follow as follow,
 )
 from fsmsm_jax.localisation.track import Track as Track, track as track
-from fsmsm_jax.localisation.resampling import (
+from fsmsm_jax.resampling import (
     Kld as Kld,
     residual_systematic as residual_systematic,
     systematic as systematic,

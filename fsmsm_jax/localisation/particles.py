@@ -41,7 +41,7 @@ from fsmsm_jax.localisation.likelihood import (
     log_likelihoods,
 )
 from fsmsm_jax.localisation.motion import OdometryModel, sample
-from fsmsm_jax.localisation.resampling import (
+from fsmsm_jax.resampling import (
     Kld,
     kld_count,
     residual_systematic,

@@ -39,7 +39,7 @@ from fsmsm_jax import geometry
 from fsmsm_jax.alignment.fmi_spomf import FmiConfig, image_spectra, rotation_and_scale
 from fsmsm_jax.localisation.clouds import init_uniform
 from fsmsm_jax.localisation.particles import ParticleConfig
-from fsmsm_jax.localisation.resampling import Kld
+from fsmsm_jax.resampling import Kld
 from fsmsm_jax.localisation.scan_offset import (
     outline_centroid,
     picture_phases,

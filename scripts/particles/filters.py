@@ -15,7 +15,7 @@ from fsmsm_jax.localisation.clouds import init_at, init_from_atlas, init_uniform
 from fsmsm_jax.localisation.likelihood import CaerLikelihood, LikelihoodField
 from fsmsm_jax.localisation.motion import OdometryModel
 from fsmsm_jax.localisation.particles import ParticleConfig, run
-from fsmsm_jax.localisation.resampling import Kld
+from fsmsm_jax.resampling import Kld
 from fsmsm_jax.world import OccupancyGrid, buildings
 from particles.navigation import INITIAL, Options
 

@@ -100,8 +100,9 @@ def range_limits(options: Options) -> Iterator[Table]:
     for name in names:
         progress(f"range: {name}")
         config = config_of(name, 0.05)
-        # Nobody waits for a hundred fresh starts of what cannot succeed.
-        config = dataclasses.replace(config, max_recoveries=10)
+        if not options.quick:  # there the program of `main` serves
+            # Nobody waits for a hundred fresh starts of what cannot succeed.
+            config = dataclasses.replace(config, max_recoveries=10)
         make = lambda reach, config=config: Matcher(config, reach)
         found = range_limit_sweep(
             asked.cases, make, reaches, 0.05, batch=len(asked.sets)

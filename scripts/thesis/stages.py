@@ -131,7 +131,7 @@ def position(options: Options) -> Iterator[Table]:
     repeats, iterations = (20 if options.quick else 400), 40
     hall = _hall(repeats)
     one = jax.tree.map(lambda a: a[:1], hall)
-    exact = np.asarray(translation_walk(one, iterations).position)
+    exact = np.asarray(translation_walk(hall, iterations).position[:1])
     rough = np.asarray(translation_walk(hall, iterations, 0.05, 0.05).position)
     with jax.enable_x64(True):
         one64 = jax.tree.map(lambda a: a[:1], _hall(1))

@@ -39,6 +39,15 @@ def stacked(worlds):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
 
 
+def in_24_walls(room):
+    """The same room, its four walls in pieces: the shape of a star, one compile."""
+    along = np.linspace(0, 1, 6, endpoint=False)[None, :, None]
+    start, end = (np.asarray(a)[:, None] for a in (room.start, room.end))
+    corners = np.reshape(start + along * (end - start), (24, 2))
+    return PolygonMap.from_outlines(corners)
+
+
+@jax.jit
 def cast(worlds, poses, bearings=BEARINGS):
     return jax.vmap(raycast, (0, 0, None))(worlds, poses, bearings)
 
@@ -82,23 +91,24 @@ def test_block_and_batch_do_not_matter():
     small = jax.jit(partial(fsmsm, block=3))(STARS, real, start, default())
     np.testing.assert_allclose(small.pose, whole.pose, atol=1e-5)
     np.testing.assert_array_equal(small.steps, whole.steps)
-    one = jax.tree.map(lambda a: a[5:6], STARS)
-    single = run(one, real[5:6], start[5:6], default())
-    np.testing.assert_allclose(single.pose[0], whole.pose[5], atol=1e-5)
+    others = jax.tree.map(lambda a: jnp.roll(a, 5, axis=0), (STARS, real, start))
+    beside = run(*others, default())
+    np.testing.assert_allclose(beside.pose, jnp.roll(whole.pose, 5, axis=0), atol=1e-5)
 
 
 def test_one_world_serves_many_scans():
-    room, truth = l_room(), truths(4, seed=8)
-    real = jax.vmap(raycast, (None, 0, None))(room, jnp.asarray(truth), BEARINGS)
+    room, truth = star(4), truths(16, seed=8)
+    copied = stacked([room] * 16)
+    real = cast(copied, jnp.asarray(truth))
     shared = run(room, real, starts(truth), default())
-    copies = run(stacked([room] * 4), real, starts(truth), default())
+    copies = run(copied, real, starts(truth), default())
     np.testing.assert_allclose(shared.pose, copies.pose, atol=1e-5)
     assert errors(shared.pose, truth)[0].max() < 1e-3
 
 
 def test_moves_with_the_world():
-    room, truth = l_room(), truths(4, seed=8)
-    real = jax.vmap(raycast, (None, 0, None))(room, jnp.asarray(truth), BEARINGS)
+    room, truth = star(4), truths(16, seed=8)
+    real = cast(stacked([room] * 16), jnp.asarray(truth))
     # By translation only: the box around the start has sides along x and y.
     shift = jnp.array([30.0, -11.0])
     moved = PolygonMap(room.start + shift[None], room.end + shift[None])
@@ -130,9 +140,8 @@ def test_grid_and_polygons_by_the_same_code():
     xy = world.to_map(jnp.stack([columns[pick], rows[pick]], axis=-1) + 0.5)
     heading = np.random.default_rng(3).uniform(-3, 3, 8)
     truth = np.column_stack([xy, heading])
-    real = jax.vmap(raycast, (None, 0, None))(
-        world, jnp.asarray(truth, float), BEARINGS
-    )
+    one = lambda pose: raycast(world, pose, BEARINGS)
+    real = jax.jit(partial(jax.lax.map, one))(jnp.asarray(truth, float))
     noise = 0.02 * np.random.default_rng(4).standard_normal(real.shape)
     found = run(world, real + jnp.asarray(noise, float), starts(truth), default())
     position, turn = errors(found.pose, truth)
@@ -143,8 +152,8 @@ def test_grid_and_polygons_by_the_same_code():
 
 def test_a_square_room_is_not_turned_into_its_twin():
     """Four headings fit a square from its middle; only one lies in the box."""
-    room, truth = square_room(), truths(16, seed=8)
-    worlds = jax.tree.map(lambda a: jnp.broadcast_to(a, (16, *a.shape)), room)
+    room, truth = in_24_walls(square_room()), truths(16, seed=8)
+    worlds = stacked([room] * 16)
     start = starts(truth, turn=0.3)
     found = run(worlds, cast(worlds, jnp.asarray(truth)), start, default())
     position, turn = errors(found.pose, truth)
@@ -155,9 +164,10 @@ def test_a_square_room_is_not_turned_into_its_twin():
 
 def test_leaving_the_map_is_recovered_from_or_reported():
     """From 0.3 m outside a wall, half of the box lies inside."""
-    room = PolygonMap.from_outlines(np.array([[0, 0], [4, 0], [4, 3], [0, 3]]) + CENTRE)
-    truth = np.array([[CENTRE[0] + 0.4, CENTRE[1] + 1.0, 0.3]])
-    real = jax.vmap(raycast, (None, 0, None))(room, jnp.asarray(truth), BEARINGS)
+    corners = np.array([[0, 0], [4, 0], [4, 3], [0, 3]]) + CENTRE
+    room = in_24_walls(PolygonMap.from_outlines(corners))
+    truth = np.tile([*(CENTRE + [0.4, 1.0]), 0.3], (16, 1))
+    real = cast(stacked([room] * 16), jnp.asarray(truth))
     outside = jnp.asarray(truth - [[0.6, 0, 0]], float)
     config = FsmsmConfig(box=(0.8, 0.5))
     found = run(room, real, outside, config)
@@ -214,7 +224,7 @@ def test_bad_settings(change, message):
 
 
 def test_floats_are_leaves():
-    """Sweeping a number must not compile anew."""
+    """Sweeping a number must not trace anew, so it does not compile either."""
     traces = []
 
     @jax.jit
@@ -225,7 +235,7 @@ def test_floats_are_leaves():
     REAL = raycast(l_room(), jnp.asarray(TRUTH[0], float), BEARINGS)[None]
     for limit in (0.1, 0.2, 0.3):
         config = FsmsmConfig.published("fourier_mellin", limit, 0.05)
-        match(config, starts(TRUTH[:1]))
+        jax.eval_shape(match, config, starts(TRUTH[:1]))
     assert len(traces) == 1
 
 

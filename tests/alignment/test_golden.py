@@ -216,7 +216,16 @@ def test_final_caer(golden):
         )
 
 
-@pytest.mark.parametrize("method", ["FMT", "DBH", "x1"])
+@pytest.mark.parametrize(
+    ("golden", "method"),
+    [
+        ("float64", "FMT"),
+        ("float64", "DBH"),
+        ("float64", "x1"),
+        ("float32", "FMT"),  # one is enough: each compiles four levels
+    ],
+    indirect=["golden"],
+)
 def test_final_poses(golden, method):
     """The whole of FSMSM with the program's settings; no case needs a recovery.
 

@@ -15,7 +15,7 @@ from fsmsm_jax.localisation.feedback import Feedback, ScanMatching
 from fsmsm_jax.localisation.likelihood import CaerLikelihood, LikelihoodField
 from fsmsm_jax.localisation.motion import OdometryModel, spread
 from fsmsm_jax.localisation.particles import ParticleConfig, run, step
-from fsmsm_jax.localisation.resampling import Kld
+from fsmsm_jax.resampling import Kld
 from tests.worlds import random_grid, square_room
 
 ABOUT = jnp.diag(jnp.asarray([0.25, 0.25, 0.0685]))
@@ -70,7 +70,7 @@ def test_it_keeps_its_place(world, log):
         assert np.isfinite(np.where(np.isneginf(leaf), 0, leaf)).all()
 
 
-@pytest.mark.parametrize("manner", ["soft_1", "soft_p", "hard"])
+@pytest.mark.parametrize("manner", ["soft_p", "hard"])
 def test_feedback_keeps_it_nearer(world, log, manner):
     told = ParticleConfig(
         motion=WHEELS, matching=ScanMatching(rays=60), feedback=Feedback(manner)
@@ -101,22 +101,23 @@ def test_caer_weighs_as_well(world, log):
 
 def test_many_seeds_are_many_runs(world, log):
     """vmap == loop, scan == loop, jit == eager, to rounding."""
-    some = jax.tree.map(lambda a: a[:4], log.scans)
+    some = jax.tree.map(lambda a: a[:20], log.scans)  # compiled for the next test, too
     keys = jax.random.split(jax.random.key(3), 3)
-
-    def once(key):
-        cloud = init_at(key, log.poses[0], ABOUT, SMALL)
-        return run(key, world, cloud, some, log.odometry[:4], SMALL)
-
-    together = jax.jit(jax.vmap(once))(keys)
+    begin = lambda key: init_at(key, log.poses[0], ABOUT, SMALL)
+    ask = lambda key, cloud: run(key, world, cloud, some, log.odometry[:20], SMALL)
+    clouds = jax.vmap(begin)(keys)
+    _, together = jax.jit(jax.vmap(ask))(keys, clouds)
     for n, key in enumerate(keys):
-        state, infos = jax.jit(once)(key)
-        np.testing.assert_allclose(together[1].pose[n], infos.pose, atol=1e-4)
-        assert np.array_equal(together[0].living[n], state.living)
+        cloud = jax.tree.map(lambda a, n=n: a[n], clouds)
+        _, alone = jitted_run(key, world, cloud, some, log.odometry[:20], SMALL)
+        # What is rounded differently is drawn differently sooner or later.
+        np.testing.assert_allclose(together.pose[n, :4], alone.pose[:4], atol=1e-4)
+        assert np.array_equal(together.living[n, :4], alone.living[:4])
+    split = jax.random.split(keys[0], 20)
     state = init_at(keys[0], log.poses[0], ABOUT, SMALL)
-    for n, key in enumerate(jax.random.split(keys[0], 4)):
+    for n, key in enumerate(split[:4]):
         state, info = step(key, world, state, scan_at(log, n), log.odometry[n], SMALL)
-        np.testing.assert_allclose(together[1].pose[0, n], info.pose, atol=1e-3)
+        np.testing.assert_allclose(together.pose[0, n], info.pose, atol=1e-3)
 
 
 def test_the_first_scan_weighs_and_standing_still_does_not(world, log):
@@ -301,5 +302,5 @@ def test_numbers_in_the_config_do_not_compile_again(world, log):
         config = ParticleConfig(
             kld=Kld(40, 150, error), likelihood=LikelihoodField(rays=30, z_hit=z_hit)
         )
-        counted(jax.random.key(0), config)
+        jax.eval_shape(counted, jax.random.key(0), config)
     assert len(traces) == 1

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fsmsm_jax.localisation.resampling import (
+from fsmsm_jax.resampling import (
     Kld,
     kld_count,
     occupied_bins,
