@@ -19,6 +19,8 @@ A tour of the house, in the order in which data passes through it:
   scan in it, `localise_batch` many. `tracker` keeps one pose up at sensor rate;
   `follow` and `track` do all of it: found, tracked, kidnapped, found again.
   `particles` keeps a cloud of poses instead of one (Monte Carlo localisation).
+- `slam`: no map at all. Landmarks found by range and bearing, and the vehicle among
+  them (FastSLAM, L-SLAM, EKF-SLAM).
 - `evaluation`, `io`, `plotting` and the `fsmsm` command line stand at the edge.
 
 Everything is a pure function of arrays and pytrees: write for one, `jax.vmap` for
@@ -72,6 +74,7 @@ from fsmsm_jax.localisation import (
     track as track,
     tracker as tracker,
 )
+from fsmsm_jax import slam as slam
 
 caer = caer_at
 __version__ = "0.1.0"

@@ -39,12 +39,12 @@ from fsmsm_jax import geometry
 from fsmsm_jax.alignment.fmi_spomf import FmiConfig, image_spectra, rotation_and_scale
 from fsmsm_jax.localisation.clouds import init_uniform
 from fsmsm_jax.localisation.particles import ParticleConfig
-from fsmsm_jax.resampling import Kld
 from fsmsm_jax.localisation.scan_offset import (
     outline_centroid,
     picture_phases,
     picture_shift,
 )
+from fsmsm_jax.resampling import Kld
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.sensing.outline_image import outline_image
 from fsmsm_jax.sensing.panorama import panorama

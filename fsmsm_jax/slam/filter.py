@@ -1,0 +1,214 @@
+r"""Landmark SLAM as a pure step: state in, state and info out.
+
+Write-up of one step, the same for the whole family (`methods`): every particle is
+*moved* by the controls, draws what it draws, pairs the detections with its landmarks,
+is *informed* by them (or draws only now), corrects its map, and is *weighed* by how
+likely the detections were. If the effective number of particles 1 / Σ w² falls under
+three quarters of them, they are drawn again by weight with one comb (residual
+systematic resampling).
+
+`run` is `step` under `jax.lax.scan`; keys of many seeds go through `jax.vmap`.
+
+Source: V. Petridis, N. Zikos, "L-SLAM", §3, equations (4) to (16); M. Montemerlo et
+al., "FastSLAM" 2002, "FastSLAM 2.0" 2003.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, ScalarLike
+
+from fsmsm_jax import geometry
+from fsmsm_jax.resampling import systematic
+from fsmsm_jax.slam import factored, joint
+from fsmsm_jax.slam.association import Association, Luck, luck_of
+from fsmsm_jax.slam.belief import PoseBelief
+from fsmsm_jax.slam.drive import Drive, seen
+from fsmsm_jax.slam.factored import Particle
+from fsmsm_jax.slam.joint import Joint
+from fsmsm_jax.slam.methods import METHODS, Name
+from fsmsm_jax.slam.sensor import RangeBearing
+from fsmsm_jax.slam.vehicle import Car, Vehicle, increment
+
+__all__ = ["Info", "SlamConfig", "State", "init", "run", "step"]
+
+
+class SlamConfig(eqx.Module):
+    """A filter and what it is told of the vehicle and the sensor."""
+
+    method: Name = eqx.field(default="lslam2", static=True)
+    """See `methods`."""
+    particles: int = eqx.field(default=40, static=True)
+    """How many; `ekf` has one."""
+    landmarks: int = eqx.field(default=64, static=True)
+    """Slots of a particle's map."""
+    vehicle: Vehicle = Car()
+    """How controls move it."""
+    sensor: RangeBearing = RangeBearing()
+    """How it finds landmarks."""
+    association: Association | None = Association()
+    """How detections find landmarks; None to believe the ids of the drive."""
+    resample_below: ScalarLike = 0.75
+    """Share of effective particles under which they are drawn again."""
+
+    def __check_init__(self):
+        if self.method not in METHODS:
+            raise ValueError(
+                f"there is no method {self.method!r}: one of {', '.join(METHODS)}"
+            )
+        if self.particles < 1 or self.landmarks < 1:
+            raise ValueError(
+                "expected at least one particle and one landmark, got "
+                f"{self.particles} and {self.landmarks}"
+            )
+        if self.method == "ekf" and self.particles != 1:
+            object.__setattr__(self, "particles", 1)
+
+
+class State(NamedTuple):
+    """All particles."""
+
+    particles: Particle | Joint
+    """With a leading axis."""
+    log_weight: Float[Array, "particles"]
+    """Normalised."""
+    key: PRNGKeyArray
+    """Of the draws to come."""
+
+
+class Info(NamedTuple):
+    """A step's estimate, with what a person would plot."""
+
+    pose: Float[Array, "*steps 3"]
+    """Of the particle that weighs most [m, m, rad]."""
+    covariance: Float[Array, "*steps 3 3"]
+    """Of all particles about their mean, and in each of them."""
+    mean: Float[Array, "*steps 3"]
+    """Of all particles."""
+    effective: Float[Array, "*steps"]
+    """Effective number of particles."""
+    known: Int[Array, "*steps"]
+    """Landmarks on the map of the heaviest particle."""
+    matched: Int[Array, "*steps"]
+    """Its detections that were of known landmarks."""
+    unplaced: Int[Array, "*steps"]
+    """Its detections of new landmarks for which there was no slot."""
+    log_evidence: Float[Array, "*steps"]
+    """Log-likelihood of the detections, given all before; its sum over a drive is the
+    evidence for what the filter was told of vehicle and sensor."""
+    usable: Bool[Array, "*steps"]
+    """Whether any particle explains the detections; where not, weights stay alike."""
+
+
+def init(
+    config: SlamConfig,
+    key: PRNGKeyArray,
+    start: Float[Array, "3"] | None = None,
+    covariance: Float[Array, "3 3"] | None = None,
+) -> State:
+    """A vehicle at a pose, with an empty map.
+
+    Args:
+        config: the filter.
+        key: of all its draws.
+        start: pose [m, m, rad]; the origin by default, as nothing tells where it is.
+        covariance: of the start, zero by default: it is where it is.
+    """
+    mean = jnp.zeros(3) if start is None else jnp.asarray(start, float)
+    spread = jnp.zeros((3, 3)) if covariance is None else covariance
+    belief = PoseBelief(mean, spread)
+    keeper = joint if METHODS[config.method].joint else factored
+    particle = keeper.blank(belief, config.landmarks)
+    repeat = lambda a: jnp.broadcast_to(a, (config.particles, *a.shape))
+    level = jnp.full(config.particles, -jnp.log(config.particles))
+    return State(jax.tree.map(repeat, particle), level, key)
+
+
+@eqx.filter_jit
+def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
+    """Move, look, weigh, and draw again if need be.
+
+    Args:
+        config: the filter.
+        state: from `init` or the step before.
+        frame: one step of a drive, without leading axes.
+
+    Returns:
+        The state after and the estimate. It stays finite whatever comes: controls that
+        are not finite move nothing, detections that are not valid are left alone.
+    """
+    method = METHODS[config.method]
+    key, *keys = jax.random.split(state.key, 4)
+    frame = seen(frame)
+    moved = increment(config.vehicle, jnp.asarray(frame.controls))
+    normals = jax.random.normal(keys[0], (config.particles, 3))
+    size = len(frame.valid), config.landmarks, config.particles
+    luck = luck_of(keys[1], config.association, *size)
+    keeper = joint if method.joint else factored
+
+    def advance(particle, normals, start):
+        mine = None if luck is None else Luck(luck.table, start)
+        told = method, config.sensor, config.association, moved, frame
+        return keeper.advance(*told, particle, normals, mine)
+
+    starts = None if luck is None else luck.start
+    particles, pairing = jax.vmap(advance)(state.particles, normals, starts)
+
+    log_weight = state.log_weight + pairing.log_likelihood
+    usable = jnp.any(jnp.isfinite(log_weight))
+    finite = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
+    finite = jnp.where(usable, finite, 0.0)
+    evidence = jax.nn.logsumexp(finite)
+    log_weight = finite - evidence
+    weight = jnp.exp(log_weight)
+    effective = 1 / jnp.sum(weight * weight)
+    info = _info(particles, pairing, weight, effective, evidence, usable)
+
+    again = effective < config.resample_below * config.particles
+    chosen = systematic(keys[2], weight, config.particles)
+    chosen = jnp.where(again, chosen, jnp.arange(config.particles))
+    particles = jax.tree.map(lambda a: a[chosen], particles)
+    level = jnp.full(config.particles, -jnp.log(config.particles))
+    return State(particles, jnp.where(again, level, log_weight), key), info
+
+
+@eqx.filter_jit
+def run(config: SlamConfig, state: State, drive: Drive) -> tuple[State, Info]:
+    """`step` through a whole drive.
+
+    Args:
+        config: the filter.
+        state: from `init`.
+        drive: from `tidied`, a log reader or the simulator.
+
+    Returns:
+        The state after the last step and the estimates of all.
+    """
+    return jax.lax.scan(lambda state, frame: step(config, state, frame), state, drive)
+
+
+def _info(particles, pairing, weight, effective, evidence, usable):
+    """The estimate of weighted particles."""
+    means, covariances = particles.belief
+    best = jnp.argmax(weight)
+    pose = means[best]
+    off = means - pose[None]
+    off = off.at[:, 2].set(geometry.wrap(off[:, 2]))
+    mean = jnp.sum(weight[:, None] * off, axis=0)
+    off = off - mean[None]
+    spread = covariances + off[:, :, None] * off[:, None, :]
+    known = particles.landmarks.known
+    paired = pairing.detection[best] >= 0
+    return Info(
+        pose,
+        jnp.sum(weight[:, None, None] * spread, axis=0),
+        pose + mean,
+        effective,
+        jnp.sum(known[best]),
+        jnp.sum(paired & known[best]),
+        pairing.unplaced[best],
+        evidence,
+        usable,
+    )
