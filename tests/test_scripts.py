@@ -135,3 +135,22 @@ def test_reproduce_fmi_quickly(tmp_path):
     assert run.returncode == 0, run.stderr
     assert "### generated office" in page.read_text()
     assert "in place of the thesis's maps" in run.stderr
+
+
+@pytest.mark.slow
+def test_reproduce_lslam_quickly(data, tmp_path):
+    """Two filters of five particles, in simulation and on the car park."""
+    page, pictures = tmp_path / "lslam.md", tmp_path / "pictures"
+    command = [sys.executable, "scripts/reproduce_lslam.py", "--quick", "--out"]
+    command += [str(pictures), "--markdown", str(page), "--only"]
+    run = subprocess.run(
+        [*command, "simulation", "carpark"],
+        cwd=ROOT,
+        env=os.environ | {"FSMSM_DATA": str(data)},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    for title in ("Simulation, 8 worlds", "Car park, as read", "as read: goals"):
+        assert title in page.read_text()
+    assert (pictures / "lslam_carpark_map.png").is_file()

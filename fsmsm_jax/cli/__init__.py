@@ -1,9 +1,10 @@
-"""The command line: `fsmsm localise MAP LOG`, `match`, `track`, `odometry`, and `demo`.
+"""The command line: `fsmsm localise MAP LOG`, `match`, `track`, `odometry`, `slam`.
 
-All end in a picture. `localise` reads a map_server map and one scan of a log (rosbag,
-CARMEN or .npz) and says where it was taken, how surely, and what else it could have
-been; `match` says so more quickly where a first estimate is at hand; `track` follows
-the lidar through a whole log; `odometry` says how it moved, from a log without any map.
+All end in a picture, as does `demo`. `localise` reads a map_server map and one scan of
+a log (rosbag, CARMEN or .npz) and says where it was taken, how surely, and what else it
+could have been; `match` says so more quickly where a first estimate is at hand; `track`
+follows the lidar through a whole log; `odometry` says how it moved, from a log without
+any map; `slam` makes a map of the landmarks that a log holds ranges and bearings of.
 `--json` says it to a program. Text and JSON go to stdout, progress to stderr. An error
 is one line on stderr and exit status 2; Ctrl-C is exit status 130.
 
@@ -24,9 +25,10 @@ from fsmsm_jax.cli.localise import localise
 from fsmsm_jax.cli.match import match
 from fsmsm_jax.cli.track import track
 from fsmsm_jax.cli.odometry import odometry
+from fsmsm_jax.cli.slam import slam
 from fsmsm_jax.cli.demo import demo
 
-__all__ = ["demo", "localise", "main", "match", "odometry", "track"]
+__all__ = ["demo", "localise", "main", "match", "odometry", "slam", "track"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "match": match,
                 "track": track,
                 "odometry": odometry,
+                "slam": slam,
                 "demo": demo,
             },
             prog="fsmsm",

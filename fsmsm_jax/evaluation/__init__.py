@@ -53,4 +53,12 @@ from fsmsm_jax.evaluation.stages import (
 from fsmsm_jax.evaluation.basins import Basin as Basin, basin as basin
 from fsmsm_jax.evaluation.ways import plan as plan
 from fsmsm_jax.evaluation.drives import Drive as Drive, drive as drive, record as record
+from fsmsm_jax.evaluation.slam import (
+    consistency as consistency,
+    map_error as map_error,
+    moved as moved,
+    onto as onto,
+    paired as paired,
+    way_error as way_error,
+)
 from fsmsm_jax.evaluation.drift import Drift as Drift, drift as drift, way as way

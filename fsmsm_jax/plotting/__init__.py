@@ -3,7 +3,8 @@
 `localisation` shows one answer on its map, `scans` the space that one scan saw;
 `thesis` shows what many answers are worth: the figures of the published evaluation,
 with the published numbers on them; `basins` from how far off a matcher still finds
-home; `tracking` the way of a robot, `odometry` the way that scans alone tell.
+home; `tracking` the way of a robot, `odometry` the way that scans alone tell,
+`slam` a map of landmarks.
 
 Import this package by its name; `import fsmsm_jax` alone does not load matplotlib.
 """
@@ -40,3 +41,9 @@ from fsmsm_jax.plotting.tracking import (
     plot_track as plot_track,
 )
 from fsmsm_jax.plotting.odometry import plot_odometry as plot_odometry
+from fsmsm_jax.plotting.slam import (
+    SLAM_COLOURS as SLAM_COLOURS,
+    plot_particle_errors as plot_particle_errors,
+    plot_run_times as plot_run_times,
+    plot_slam as plot_slam,
+)

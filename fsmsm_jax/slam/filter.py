@@ -1,6 +1,6 @@
 r"""Landmark SLAM as a pure step: state in, state and info out.
 
-Write-up of one step, the same for the whole family (`methods`): every particle is
+One step is the same for the whole family (`methods`): every particle is
 *moved* by the controls, draws what it draws, pairs the detections with its landmarks,
 is *informed* by them (or draws only now), corrects its map, and is *weighed* by how
 likely the detections were. If the effective number of particles 1 / Σ w² falls under
@@ -13,6 +13,7 @@ Source: V. Petridis, N. Zikos, "L-SLAM", §3, equations (4) to (16); M. Montemer
 al., "FastSLAM" 2002, "FastSLAM 2.0" 2003.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,6 +29,7 @@ from fsmsm_jax.slam.belief import PoseBelief
 from fsmsm_jax.slam.drive import Drive, seen
 from fsmsm_jax.slam.factored import Particle
 from fsmsm_jax.slam.joint import Joint
+from fsmsm_jax.slam.landmarks import Landmarks
 from fsmsm_jax.slam.methods import METHODS, Name
 from fsmsm_jax.slam.sensor import RangeBearing
 from fsmsm_jax.slam.vehicle import Car, Vehicle, increment
@@ -74,19 +76,27 @@ class State(NamedTuple):
     """With a leading axis."""
     log_weight: Float[Array, "particles"]
     """Normalised."""
+    best: Int[Array, ""]
+    """Which particle weighed most when last they differed."""
     key: PRNGKeyArray
     """Of the draws to come."""
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """The map of that particle; for one state, not for a batch of them."""
+        return jax.tree.map(lambda a: a[self.best], self.particles.landmarks)
 
 
 class Info(NamedTuple):
     """A step's estimate, with what a person would plot."""
 
     pose: Float[Array, "*steps 3"]
-    """Of the particle that weighs most [m, m, rad]."""
+    """Of the particle that weighs most [m, m, rad], as the paper reports it."""
     covariance: Float[Array, "*steps 3 3"]
     """Of all particles about their mean, and in each of them."""
     mean: Float[Array, "*steps 3"]
-    """Of all particles."""
+    """Of all particles: steadier where many are in the race, as the heaviest changes
+    and each has its own map."""
     effective: Float[Array, "*steps"]
     """Effective number of particles."""
     known: Int[Array, "*steps"]
@@ -122,8 +132,14 @@ def init(
     keeper = joint if METHODS[config.method].joint else factored
     particle = keeper.blank(belief, config.landmarks)
     repeat = lambda a: jnp.broadcast_to(a, (config.particles, *a.shape))
-    level = jnp.full(config.particles, -jnp.log(config.particles))
-    return State(jax.tree.map(repeat, particle), level, key)
+    return State(
+        jax.tree.map(repeat, particle), _level(config), jnp.zeros((), int), key
+    )
+
+
+def _level(config):
+    """Logarithms of equal weights."""
+    return jnp.full(config.particles, -math.log(config.particles), float)
 
 
 @eqx.filter_jit
@@ -164,14 +180,17 @@ def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
     log_weight = finite - evidence
     weight = jnp.exp(log_weight)
     effective = 1 / jnp.sum(weight * weight)
-    info = _info(particles, pairing, weight, effective, evidence, usable)
+    known = state.particles.landmarks.known
+    info = _info(particles, pairing, known, weight, effective, evidence, usable)
 
     again = effective < config.resample_below * config.particles
     chosen = systematic(keys[2], weight, config.particles)
     chosen = jnp.where(again, chosen, jnp.arange(config.particles))
     particles = jax.tree.map(lambda a: a[chosen], particles)
-    level = jnp.full(config.particles, -jnp.log(config.particles))
-    return State(particles, jnp.where(again, level, log_weight), key), info
+    # The heaviest is drawn at least once.
+    best = jnp.argmax(chosen == jnp.argmax(log_weight))
+    log_weight = jnp.where(again, _level(config), log_weight)
+    return State(particles, log_weight, best, key), info
 
 
 @eqx.filter_jit
@@ -189,7 +208,7 @@ def run(config: SlamConfig, state: State, drive: Drive) -> tuple[State, Info]:
     return jax.lax.scan(lambda state, frame: step(config, state, frame), state, drive)
 
 
-def _info(particles, pairing, weight, effective, evidence, usable):
+def _info(particles, pairing, before, weight, effective, evidence, usable):
     """The estimate of weighted particles."""
     means, covariances = particles.belief
     best = jnp.argmax(weight)
@@ -199,15 +218,13 @@ def _info(particles, pairing, weight, effective, evidence, usable):
     mean = jnp.sum(weight[:, None] * off, axis=0)
     off = off - mean[None]
     spread = covariances + off[:, :, None] * off[:, None, :]
-    known = particles.landmarks.known
-    paired = pairing.detection[best] >= 0
     return Info(
         pose,
         jnp.sum(weight[:, None, None] * spread, axis=0),
         pose + mean,
         effective,
-        jnp.sum(known[best]),
-        jnp.sum(paired & known[best]),
+        jnp.sum(particles.landmarks.known[best]),
+        jnp.sum((pairing.detection[best] >= 0) & before[best]),
         pairing.unplaced[best],
         evidence,
         usable,

@@ -88,7 +88,9 @@ def advance(
     rows = carry @ covariance[:3]
     covariance = covariance.at[:3].set(rows).at[:, :3].set(rows.T)
     covariance = covariance.at[:3, :3].set(rows[:, :3] @ carry.T + added)
-    mean, covariance = draw(mean.at[:3].set(pose), covariance, method.draws, normals)
+    mean = mean.at[:3].set(pose)
+    if not method.looks_first:
+        mean, covariance = draw(mean, covariance, method.draws, normals)
 
     particle = Joint(mean, covariance, particle.evidence)
     slots = jnp.arange(particle.evidence.size)
@@ -127,6 +129,9 @@ def advance(
     starts = None if luck is None else luck.start
     rows = order, frame.detections, frame.valid, may_start, ids, starts
     (after, paired, likely, unplaced), _ = jax.lax.scan(one, (particle, *none), rows)
+    if method.looks_first:
+        both = draw(after.mean, after.covariance, method.draws, normals)
+        after = Joint(*both, after.evidence)
     found = paired >= 0
     rated = evidence_after(rules, particle.landmarks, found, after.mean[:3], sensor)
     after = after._replace(evidence=rated)

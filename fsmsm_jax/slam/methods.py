@@ -8,6 +8,7 @@
 | `lslam` | heading | motion | one filter each, sharing the position |
 | `lslam2` | heading | motion and look | one filter each, sharing the position |
 | `lslam_joint` | heading | motion | joint |
+| `lslam2_joint` | heading | motion and look | joint |
 
 Particles must cover what is drawn: three numbers need more of them than one, and a
 draw that knows what was seen needs fewer than one that does not. What is not drawn is
@@ -19,7 +20,15 @@ from typing import Literal, NamedTuple
 
 __all__ = ["METHODS", "Method", "Name"]
 
-Name = Literal["ekf", "fastslam1", "fastslam2", "lslam", "lslam2", "lslam_joint"]
+Name = Literal[
+    "ekf",
+    "fastslam1",
+    "fastslam2",
+    "lslam",
+    "lslam2",
+    "lslam_joint",
+    "lslam2_joint",
+]
 
 
 class Method(NamedTuple):
@@ -53,4 +62,5 @@ METHODS: dict[Name, Method] = {
     "lslam": Method(_HEADING, looks_first=False, expected=False),
     "lslam2": Method(_HEADING, looks_first=True, expected=False),
     "lslam_joint": Method(_HEADING, looks_first=False, expected=False, joint=True),
+    "lslam2_joint": Method(_HEADING, looks_first=True, expected=False, joint=True),
 }

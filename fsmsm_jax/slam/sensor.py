@@ -79,7 +79,7 @@ def sight(
     sensor: RangeBearing,
     pose: Float[Array, "3"],
     landmark: Pair,
-    detection: Float[Array, "*shape 2"],
+    detection: Float[Array, "*#shape 2"],
     *,
     expected: bool,
 ) -> Sight:
