@@ -25,6 +25,7 @@ SLAM_COLOURS = {
     "lslam": POSE,
     "lslam2": TRUTH,
     "lslam_joint": INK,
+    "lslam2_joint": "#8a4b08",
     "ekf": "#b9bec8",
 }
 """Of the methods."""

@@ -37,21 +37,21 @@ class Drive(NamedTuple):
 
 
 def tidied(
-    controls: Shaped[np.ndarray, "steps controls 3"],
-    detections: Shaped[np.ndarray, "steps detections 2"],
-    valid: Shaped[np.ndarray, "steps detections"] | None = None,
-    ids: Shaped[np.ndarray, "steps detections"] | None = None,
+    controls: Shaped[np.ndarray, "..."],
+    detections: Shaped[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
+    ids: Shaped[np.ndarray, "..."] | None = None,
 ) -> Drive:
     """A drive of what a log says, safe to filter.
 
     Args:
-        controls: speed [m/s], steering [rad] and duration [s] of each. Speeds and
-            steerings that are not finite repeat the last that was, or are zero;
-            durations that are not finite are zero.
-        detections: range [m] and bearing [rad]. What is not finite, or not farther
-            than zero, is no detection.
-        valid: which detections there are, by default all that can be.
-        ids: which landmark each is, by default unknown (−1).
+        controls: [steps, controls, 3], speed [m/s], steering [rad] and duration [s] of
+            each. Speeds and steerings that are not finite repeat the last that was, or
+            are zero; durations that are not finite are zero.
+        detections: [steps, detections, 2], range [m] and bearing [rad]. What is not
+            finite, or not farther than zero, is no detection.
+        valid: [steps, detections], which there are; by default all that can be.
+        ids: [steps, detections], which landmark each is; by default unknown (−1).
 
     Raises:
         ValueError: the shapes do not fit, a duration is negative, or an id is below −1.

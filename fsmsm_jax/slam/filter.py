@@ -170,12 +170,16 @@ def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
         return keeper.advance(*told, particle, normals, mine)
 
     starts = None if luck is None else luck.start
-    particles, pairing = jax.vmap(advance)(state.particles, normals, starts)
+    after, pairing = jax.vmap(advance)(state.particles, normals, starts)
+    sound = _finite(after) & jnp.isfinite(pairing.log_likelihood)
+    # A particle that can make no sense of the look stays as it was, without weight.
+    keep = lambda a, b: jnp.where(sound.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    particles = jax.tree.map(keep, after, state.particles)
 
     log_weight = state.log_weight + pairing.log_likelihood
-    usable = jnp.any(jnp.isfinite(log_weight))
-    finite = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
-    finite = jnp.where(usable, finite, 0.0)
+    finite = jnp.where(sound, log_weight, -jnp.inf)
+    usable = jnp.any(jnp.isfinite(finite))
+    finite = jnp.where(usable, finite, state.log_weight)
     evidence = jax.nn.logsumexp(finite)
     log_weight = finite - evidence
     weight = jnp.exp(log_weight)
@@ -206,6 +210,12 @@ def run(config: SlamConfig, state: State, drive: Drive) -> tuple[State, Info]:
         The state after the last step and the estimates of all.
     """
     return jax.lax.scan(lambda state, frame: step(config, state, frame), state, drive)
+
+
+def _finite(particles):
+    """Which particles are made of finite numbers."""
+    good = lambda a: jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim)))
+    return jnp.all(jnp.stack([good(a) for a in jax.tree.leaves(particles)]), axis=0)
 
 
 def _info(particles, pairing, before, weight, effective, evidence, usable):

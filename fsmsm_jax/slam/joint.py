@@ -124,7 +124,8 @@ def advance(
             unplaced + (there & alone & choice.unplaced),
         ), None
 
-    none = jnp.full(slots.size, -1), jnp.zeros(()), jnp.zeros((), int)
+    lost = jnp.sum(frame.valid & (frame.ids >= slots.size)) if rules is None else 0
+    none = jnp.full(slots.size, -1), jnp.zeros(()), jnp.asarray(lost, int)
     order = jnp.arange(len(ids))
     starts = None if luck is None else luck.start
     rows = order, frame.detections, frame.valid, may_start, ids, starts

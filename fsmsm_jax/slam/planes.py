@@ -52,8 +52,11 @@ class Sym2(NamedTuple):
         )
 
     def determinant(self) -> Float[Array, "*shape"]:
-        """Never negative, for matrices that are covariances up to rounding."""
-        return jnp.maximum(self.xx * self.yy - self.xy * self.xy, 0)
+        """Above zero: as small as rounding lets one tell, for singular covariances."""
+        square = self.xx * self.yy
+        info = jnp.finfo(square.dtype)
+        least = jnp.maximum(info.eps * square, info.tiny)
+        return jnp.maximum(square - self.xy * self.xy, least)
 
     def inverse(self) -> "Sym2":
         """Of positive definite ones."""

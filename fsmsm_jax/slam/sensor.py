@@ -102,7 +102,9 @@ def sight(
             (along - x, across - y), noise, (none - across, none + along), none
         )
     sigma, spread = sensor.noise
-    reach = jnp.sqrt(jnp.maximum(x * x + y * y, 1e-6))  # a millimetre: never 0 / 0
+    here = x * x + y * y < 1e-6  # within a millimetre there is no direction: ahead
+    x, y = jnp.where(here, 1e-3, x), jnp.where(here, 0.0, y)
+    reach = jnp.sqrt(x * x + y * y)
     c, s = x / reach, y / reach
     u, v = _direction(pose[2], detection[..., 1])
     ahead = detection[..., 0] - reach

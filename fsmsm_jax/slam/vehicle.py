@@ -90,7 +90,7 @@ def increment(vehicle: Vehicle, controls: Float[Array, "controls 3"]) -> Increme
     Args:
         vehicle: how controls move it, and their noise.
         controls: speed [m/s], steering [rad] (or turn rate [rad/s]), duration [s]. One
-            that is not finite moves nothing.
+            that is not finite, or turns more than once around, moves nothing.
 
     Example:
         >>> left = jnp.array([[2.0, 0.0, 0.5], [2.0, 0.0, 0.5]])
@@ -103,6 +103,10 @@ def increment(vehicle: Vehicle, controls: Float[Array, "controls 3"]) -> Increme
     control, seconds = controls[:, :2], controls[:, 2]
     rates = jax.vmap(vehicle.rates)(control) * seconds[:, None]
     slopes = jax.vmap(jax.jacfwd(vehicle.rates))(control) * seconds[:, None, None]
+
+    sane = jnp.abs(rates[:, 2]) < 2 * jnp.pi
+    rates = jnp.where(sane[:, None], rates, 0.0)
+    slopes = jnp.where(sane[:, None, None], slopes, 0.0)
 
     turned = jnp.cumsum(rates[:, 2])
     along = turned - rates[:, 2] / 2
@@ -118,4 +122,4 @@ def increment(vehicle: Vehicle, controls: Float[Array, "controls 3"]) -> Increme
     effect = jnp.concatenate([slid, slopes[:, 2:]], axis=1)
     effect = effect * jnp.stack([*map(jnp.asarray, vehicle.noise)])[None, None]
     covariance = jnp.einsum("kiu,kju->ij", effect, effect)
-    return Increment(jnp.append(end, turned[-1]), covariance)
+    return Increment(jnp.append(end, jnp.sum(rates[:, 2])), covariance)

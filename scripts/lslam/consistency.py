@@ -45,6 +45,7 @@ COMPARED: tuple[Name, ...] = ("fastslam2", "lslam", "lslam_joint")
 MANY: tuple[tuple[Name, int], ...] = (
     *((m, p) for p in (40, 200) for m in COMPARED),
     ("lslam2", 200),
+    ("lslam2_joint", 200),
     EKF,
 )
 
