@@ -60,7 +60,8 @@ class Association(eqx.Module):
     drawn: bool = eqx.field(default=True, static=True)
     """Whether the landmark is drawn by likelihood (Monte Carlo) or the likeliest."""
     missed: ScalarLike = 0.02
-    """Evidence that a landmark loses when it should have been found and was not."""
+    """Evidence that a landmark loses when it should have been found and was not: one
+    over the looks after which a thing seen once is forgotten."""
     most: ScalarLike = 10.0
     """Evidence that a landmark can have; it earns 1 each time it is found."""
 
@@ -222,7 +223,8 @@ def by_id(
         belief: of the pose before the look.
         sensor: its noise.
         frame: a step. Detections without an id, or with one that has no slot, are left
-            alone; of two detections of one landmark the first counts.
+            alone; of two detections of one landmark the first counts. No gate: an id
+            is believed, however far off its detection is.
         expected: where to linearise, see `sight`.
         free: coordinates that the belief leaves open: 0, 2 or 3.
     """

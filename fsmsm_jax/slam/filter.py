@@ -26,7 +26,7 @@ from fsmsm_jax.resampling import systematic
 from fsmsm_jax.slam import factored, joint
 from fsmsm_jax.slam.association import Association, Luck, luck_of
 from fsmsm_jax.slam.belief import PoseBelief
-from fsmsm_jax.slam.drive import Drive, seen
+from fsmsm_jax.slam.drive import Drive, Numbers, seen
 from fsmsm_jax.slam.factored import Particle
 from fsmsm_jax.slam.joint import Joint
 from fsmsm_jax.slam.landmarks import Landmarks
@@ -109,14 +109,14 @@ class Info(NamedTuple):
     """Log-likelihood of the detections, given all before; its sum over a drive is the
     evidence for what the filter was told of vehicle and sensor."""
     usable: Bool[Array, "*steps"]
-    """Whether any particle explains the detections; where not, weights stay alike."""
+    """Whether any particle explains the detections; else weights stay as they were."""
 
 
 def init(
     config: SlamConfig,
     key: PRNGKeyArray,
-    start: Float[Array, "3"] | None = None,
-    covariance: Float[Array, "3 3"] | None = None,
+    start: Float[Numbers, "3"] | None = None,
+    covariance: Float[Numbers, "3 3"] | None = None,
 ) -> State:
     """A vehicle at a pose, with an empty map.
 
@@ -127,7 +127,7 @@ def init(
         covariance: of the start, zero by default: it is where it is.
     """
     mean = jnp.zeros(3) if start is None else jnp.asarray(start, float)
-    spread = jnp.zeros((3, 3)) if covariance is None else covariance
+    spread = jnp.zeros((3, 3)) if covariance is None else jnp.asarray(covariance, float)
     belief = PoseBelief(mean, spread)
     keeper = joint if METHODS[config.method].joint else factored
     particle = keeper.blank(belief, config.landmarks)
@@ -142,7 +142,7 @@ def _level(config):
     return jnp.full(config.particles, -math.log(config.particles), float)
 
 
-@eqx.filter_jit
+@jax.jit
 def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
     """Move, look, weigh, and draw again if need be.
 
@@ -153,7 +153,8 @@ def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
 
     Returns:
         The state after and the estimate. It stays finite whatever comes: controls that
-        are not finite move nothing, detections that are not valid are left alone.
+        are not finite move nothing, detections that are not valid are left alone, and
+        a particle that can make no sense of the look stays as it was before the step.
     """
     method = METHODS[config.method]
     key, *keys = jax.random.split(state.key, 4)
@@ -197,7 +198,7 @@ def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
     return State(particles, log_weight, best, key), info
 
 
-@eqx.filter_jit
+@jax.jit
 def run(config: SlamConfig, state: State, drive: Drive) -> tuple[State, Info]:
     """`step` through a whole drive.
 
@@ -228,10 +229,11 @@ def _info(particles, pairing, before, weight, effective, evidence, usable):
     mean = jnp.sum(weight[:, None] * off, axis=0)
     off = off - mean[None]
     spread = covariances + off[:, :, None] * off[:, None, :]
+    wrapped = lambda pose: pose.at[2].set(geometry.wrap(pose[2]))
     return Info(
-        pose,
+        wrapped(pose),
         jnp.sum(weight[:, None, None] * spread, axis=0),
-        pose + mean,
+        wrapped(pose + mean),
         effective,
         jnp.sum(particles.landmarks.known[best]),
         jnp.sum((pairing.detection[best] >= 0) & before[best]),

@@ -44,7 +44,7 @@ class Joint(NamedTuple):
     mean: Float[Array, "*particles numbers"]
     """Pose [m, m, rad], then x, y of each slot [m]."""
     covariance: Float[Array, "*particles numbers numbers"]
-    """Of it all; slots that are free correlate with nothing."""
+    """Of it all; what it says of free slots means nothing."""
     evidence: Float[Array, "*particles slots"]
     """How sure it is that there is a landmark; 0 for a free slot."""
 
@@ -146,10 +146,8 @@ def _spread(particle: Joint, look: Sight) -> Sym2:
     spread = spread.plus(seen_from(particle.belief, look, 3))
     # Less twice the correlation of a landmark with where it is seen from.
     across = particle.covariance[:3, 3:].reshape(3, -1, 2)
-    x, y = (
-        across[0] + across[2] * look.arm[0][:, None],
-        (across[1] + across[2] * look.arm[1][:, None]),
-    )
+    x = across[0] + across[2] * look.arm[0][:, None]
+    y = across[1] + across[2] * look.arm[1][:, None]
     both = Sym2(2 * x[:, 0], x[:, 1] + y[:, 0], 2 * y[:, 1])
     return spread.minus(both)
 
