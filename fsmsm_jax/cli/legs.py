@@ -73,7 +73,7 @@ def drive_through(
             now = slice(len(infos) * length, (len(infos) + 1) * length)
             leg = jax.tree.map(lambda a, now=now: a[now], drive)
             if program is None:
-                program, taken = timed(jax.jit(run).lower(config, state, leg).compile)
+                program, taken = timed(run.lower(config, state, leg).compile)
                 compiling += taken
             (after, info), taken = timed(partial(program, config, state, leg))
             seconds += taken

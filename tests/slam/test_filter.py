@@ -75,12 +75,10 @@ HARMLESS = ["clean", "blind", "zero range", "negative range", "nan", "nan bearin
 @pytest.mark.parametrize(
     ("method", "association"),
     [
-        ("ekf", UNKNOWN),
+        ("ekf", None),
         ("fastslam1", None),
         ("fastslam2", UNKNOWN),
-        ("lslam", UNKNOWN),
-        ("lslam2", None),
-        ("lslam_joint", None),
+        ("lslam2", UNKNOWN),
         ("lslam2_joint", UNKNOWN),
     ],
 )
