@@ -59,8 +59,8 @@ def slam(
     """Map landmarks, and say how a vehicle moved among them, by one log of both.
 
     The log holds controls, and range and bearing of what was detected. Without a log,
-    a drive is simulated. Poses are in the frame of the log's first pose; what the log
-    knows of the truth is compared with and never used.
+    a drive is simulated. Poses are in the frame in which the log gives its start; what
+    it knows of the truth is compared with and never used.
 
     Args:
         log: folder of the ACFR car park, of Victoria Park or of a robot of UTIAS

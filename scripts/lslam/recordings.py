@@ -18,15 +18,13 @@ from fsmsm_jax.slam.filter import SlamConfig
 from fsmsm_jax.slam.methods import Name
 from lslam.runs import METHODS, Found, Options, found, spread
 
-SLOTS = 512
+SLOTS = 768
 RULES = Association(missed=0.1)
 MENDED = (1.036, 0.0055)
 ASKED: tuple[tuple[Name, int, tuple[float, float]], ...] = (
     ("lslam2", 20, MENDED),
-    ("lslam2", 40, MENDED),
-    ("lslam2", 40, (1.0, 0.0)),
-    ("lslam", 40, MENDED),
-    ("fastslam2", 40, MENDED),
+    ("lslam2", 20, (1.0, 0.0)),
+    ("lslam", 20, MENDED),
 )
 MRCLAM_SECONDS, MRCLAM_SEEDS = 700.0, 20
 
