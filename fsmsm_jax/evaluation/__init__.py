@@ -31,6 +31,7 @@ from fsmsm_jax.evaluation.estimates import (
     Estimate as Estimate,
     Spread as Spread,
     mean_of as mean_of,
+    paired as paired,
     quantile_of as quantile_of,
     share_of as share_of,
     spread_of as spread_of,
@@ -58,7 +59,6 @@ from fsmsm_jax.evaluation.slam import (
     map_error as map_error,
     moved as moved,
     onto as onto,
-    paired as paired,
     way_error as way_error,
 )
 from fsmsm_jax.evaluation.drift import Drift as Drift, drift as drift, way as way

@@ -10,8 +10,9 @@ number here comes with an interval that holds the true one in 95 of 100 experime
   as these it takes some hundred draws to be true;
 - a share by Wilson's interval, which does not claim certainty at 100 %.
 
-Draws are taken to be independent. Two methods on the same cases are better compared by
-the interval of their *differences*, case by case: `mean_of(ours - theirs)`.
+Draws are taken to be independent. Two methods on the same cases (or seeds) are better
+compared by their *differences*, case by case: `mean_of(ours - theirs)` is the interval,
+`paired` says how many standard errors lie between the two.
 """
 
 import math
@@ -21,7 +22,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Shaped
 from scipy import stats
 
-__all__ = ["Estimate", "Spread", "mean_of", "quantile_of", "share_of", "spread_of"]
+__all__ = [
+    "Estimate",
+    "Paired",
+    "Spread",
+    "mean_of",
+    "paired",
+    "quantile_of",
+    "share_of",
+    "spread_of",
+]
+
+Sample = Shaped[np.ndarray, "n"] | Shaped[Array, "n"]
 
 _Z = 1.959964  # of the standard normal, 2.5 % above
 
@@ -43,7 +55,21 @@ class Spread(NamedTuple):
     """The error that nine of ten stay under."""
 
 
-def mean_of(sample: Shaped[np.ndarray, "n"] | Shaped[Array, "n"]) -> Estimate:
+class Paired(NamedTuple):
+    """By how much one method is better than another on the same seeds."""
+
+    gain: float
+    """Mean of theirs less ours."""
+    error: float
+    """Its standard error."""
+
+    @property
+    def sigmas(self) -> float:
+        """The gain in standard errors; 0 where nothing differs."""
+        return self.gain / self.error if self.error > 0 else 0.0
+
+
+def mean_of(sample: Sample) -> Estimate:
     """Mean ± 1.96 standard errors; a single draw has an infinite one.
 
     Example:
@@ -58,9 +84,7 @@ def mean_of(sample: Shaped[np.ndarray, "n"] | Shaped[Array, "n"]) -> Estimate:
     return Estimate(value, value - error, value + error)
 
 
-def quantile_of(
-    sample: Shaped[np.ndarray, "n"] | Shaped[Array, "n"], q: float = 0.5
-) -> Estimate:
+def quantile_of(sample: Sample, q: float = 0.5) -> Estimate:
     """Quantile between its order statistics; infinite where n is too small to say.
 
     Example:
@@ -97,14 +121,34 @@ def share_of(yes: Bool[np.ndarray, "n"] | Bool[Array, "n"]) -> Estimate:
     return Estimate(p, max(0.0, centre - half), min(1.0, centre + half))
 
 
-def spread_of(
-    sample: Shaped[np.ndarray, "n"] | Shaped[Array, "n"],
-) -> Spread:
+def spread_of(sample: Sample) -> Spread:
     """Median, mean and 90th percentile."""
     return Spread(quantile_of(sample), mean_of(sample), quantile_of(sample, 0.9))
 
 
-def _checked(sample: Shaped[np.ndarray, "n"] | Shaped[Array, "n"]) -> np.ndarray:
+def paired(ours: Sample, theirs: Sample) -> Paired:
+    """How much smaller our errors are than theirs, seed by seed.
+
+    Raises:
+        ValueError: not as many of ours as of theirs, or fewer than two.
+
+    Example:
+        >>> gain = paired(np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.5, 4.5]))
+        >>> gain.gain, round(gain.error, 3), round(gain.sigmas, 2)
+        (1.0, 0.289, 3.46)
+    """
+    ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
+    if ours.shape != theirs.shape or len(ours) < 2:
+        raise ValueError(
+            "expected as many of ours as of theirs, two or more, got "
+            f"{len(ours)} and {len(theirs)}"
+        )
+    gains = theirs - ours
+    error = np.std(gains, ddof=1) / np.sqrt(len(gains))
+    return Paired(float(np.mean(gains)), float(error))
+
+
+def _checked(sample: Sample) -> np.ndarray:
     sample = np.asarray(sample, float)
     if sample.size == 0:
         raise ValueError("a statistic of nothing: the sample is empty")

@@ -11,8 +11,7 @@ Is a filter as sure as it may be? Squares of errors in units of the claimed cova
 with n k degrees of freedom, divided by n, so an interval can be told which it leaves in
 one step of twenty.
 
-Filters draw at random: compare two of them on the same seeds, by the mean of the
-differences and its standard error.
+Filters draw at random: compare two of them on the same seeds (`estimates.paired`).
 
 Reference: T. Bailey, J. Nieto, E. Nebot, "Consistency of the FastSLAM algorithm", ICRA
 2006; the rigid fit is that of S. Umeyama, T-PAMI 13(4), 1991, in the plane.
@@ -28,19 +27,16 @@ from scipy.optimize import linear_sum_assignment
 __all__ = [
     "Consistency",
     "MapError",
-    "Paired",
     "WayError",
     "chi2_bounds",
     "consistency",
     "map_error",
     "moved",
     "onto",
-    "paired",
     "way_error",
 ]
 
 Points = Shaped[np.ndarray, "*runs n 2"] | Shaped[Array, "*runs n 2"]
-Sample = Shaped[np.ndarray, "n"] | Shaped[Array, "n"]
 
 
 class WayError(NamedTuple):
@@ -56,12 +52,12 @@ class WayError(NamedTuple):
     @property
     def rms(self) -> Float[np.ndarray, "*runs"]:
         """Root mean square of the distances [m]."""
-        return np.asarray(np.sqrt(np.mean(self.distance**2, axis=-1)))
+        return _rms(self.distance)
 
     @property
     def aligned_rms(self) -> Float[np.ndarray, "*runs"]:
         """Of the distances that alignment leaves [m]."""
-        return np.asarray(np.sqrt(np.mean(self.aligned**2, axis=-1)))
+        return _rms(self.aligned)
 
 
 class MapError(NamedTuple):
@@ -77,9 +73,7 @@ class MapError(NamedTuple):
     @property
     def rms(self) -> float:
         """Root mean square of the pairs' distances [m]; NaN if there are none."""
-        if not self.distance.size:
-            return float("nan")
-        return float(np.sqrt(np.mean(self.distance**2)))
+        return float(_rms(self.distance)) if self.distance.size else float("nan")
 
 
 class Consistency(NamedTuple):
@@ -104,22 +98,12 @@ class Consistency(NamedTuple):
         return float(np.nanmean(self.average))
 
 
-class Paired(NamedTuple):
-    """By how much one method is better than another on the same seeds."""
-
-    gain: float
-    """Mean of theirs less ours."""
-    error: float
-    """Its standard error."""
-
-    @property
-    def sigmas(self) -> float:
-        """The gain in standard errors; 0 where nothing differs."""
-        return self.gain / self.error if self.error > 0 else 0.0
+def _rms(distance: np.ndarray) -> np.ndarray:
+    return np.asarray(np.sqrt(np.mean(distance**2, axis=-1)))
 
 
 def way_error(
-    times: Sample,
+    times: Shaped[np.ndarray, "n"] | Shaped[Array, "n"],
     poses: Shaped[np.ndarray, "*runs steps 3"] | Shaped[Array, "*runs steps 3"],
     fixes: Shaped[np.ndarray, "fixes 3"] | Shaped[Array, "fixes 3"],
 ) -> WayError:
@@ -286,25 +270,3 @@ def consistency(
 
 
 _SINGULAR = 1e-6  # smallest eigenvalue of a correlation that float32 can tell from 0
-
-
-def paired(ours: Sample, theirs: Sample) -> Paired:
-    """How much smaller our errors are than theirs, seed by seed.
-
-    Raises:
-        ValueError: not as many of ours as of theirs, or fewer than two.
-
-    Example:
-        >>> gain = paired(np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.5, 4.5]))
-        >>> gain.gain, round(gain.error, 3), round(gain.sigmas, 2)
-        (1.0, 0.289, 3.46)
-    """
-    ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
-    if ours.shape != theirs.shape or len(ours) < 2:
-        raise ValueError(
-            "expected as many of ours as of theirs, two or more, got "
-            f"{len(ours)} and {len(theirs)}"
-        )
-    gains = theirs - ours
-    error = np.std(gains, ddof=1) / np.sqrt(len(gains))
-    return Paired(float(np.mean(gains)), float(error))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 
 from fsmsm_jax.io.frames import yaw
+from fsmsm_jax.io.tables import rows_of
 
 __all__ = ["TumWriter", "read_tum", "write_tum"]
 
@@ -101,22 +102,13 @@ def read_tum(
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"there is no trajectory at {path}")
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = text.splitlines()
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        try:
-            row = [float(field) for field in line.split()]
-            if len(row) != 8:
-                raise ValueError(f"{len(row)} numbers instead of 8")
-        except ValueError as error:
-            if number == len(lines) and not text.endswith("\n"):
-                break
-            raise ValueError(
-                f"{path.name}, line {number} is no `t x y z qx qy qz qw`: {error}"
-            ) from error
-        rows.append(row)
+
+    def whole(fields):
+        row = [float(field) for field in fields]
+        if len(row) != 8:
+            raise ValueError(f"{len(row)} numbers instead of 8")
+        return row
+
+    rows = rows_of(path, whole, " is no `t x y z qx qy qz qw`")
     table = np.array(rows, float).reshape(-1, 8)
     return table[:, 0], np.column_stack([table[:, 1:3], yaw(table[:, 4:])])

@@ -80,7 +80,7 @@ class Pairing(NamedTuple):
 
 
 class Luck(NamedTuple):
-    """Random numbers for Monte Carlo association.
+    """Random numbers for Monte Carlo association; zeros where nothing is drawn.
 
     The largest of log-likelihoods plus Gumbel numbers is a draw in proportion to the
     likelihoods. Fresh ones for each particle, detection and slot would cost more than
@@ -88,17 +88,17 @@ class Luck(NamedTuple):
     """
 
     table: Float[Array, "numbers"]
-    """Independent standard Gumbel numbers."""
+    """Independent standard Gumbel numbers, or zeros."""
     start: Int[Array, "*shape detections"]
     """Where the stretch of each detection begins."""
 
 
 def luck_of(
     key: PRNGKeyArray, rules: Association | None, detections: int, slots: int, many: int
-) -> Luck | None:
-    """Luck for many particles; None where nothing is drawn."""
+) -> Luck:
+    """Luck for many particles."""
     if rules is None or not rules.drawn:
-        return None
+        return Luck(jnp.zeros(slots), jnp.zeros((many, detections), int))
     one, other = jax.random.split(key)
     table = jax.random.gumbel(one, (slots + 1024,))
     start = jax.random.randint(other, (many, detections), 0, 1025)
@@ -124,7 +124,7 @@ def choose(
     spread: Sym2,
     known: Bool[Array, "slots"],
     vacant: Bool[Array, "slots"],
-    luck: Luck | None,
+    luck: Luck,
 ) -> Choice:
     """Which landmark a detection is of, if any.
 
@@ -134,7 +134,7 @@ def choose(
         spread: covariance of each residual, all uncertainties included.
         known: which slots hold landmarks.
         vacant: which have no detection in this look.
-        luck: of Monte Carlo association; None for the likeliest landmark.
+        luck: of this detection, for Monte Carlo association.
     """
     apart = spread.inverse().form(look.residual, look.residual)
     apart = jnp.where(known, apart, jnp.inf)
@@ -142,8 +142,7 @@ def choose(
     score = jnp.where(inside, evidence(look, spread), -jnp.inf)
     # Once for all reductions, which would each compute them again.
     apart, inside, score = jax.lax.optimization_barrier((apart, inside, score))
-    if luck is not None:
-        score = score + jax.lax.dynamic_slice_in_dim(luck.table, luck.start, known.size)
+    score = score + jax.lax.dynamic_slice_in_dim(luck.table, luck.start, known.size)
     best = jnp.argmax(score)
     matched = jnp.any(inside)
     far = ~matched & (jnp.min(apart) > rules.new)
@@ -241,7 +240,7 @@ def by_id(
 
 
 def associate(
-    luck: Luck | None,
+    luck: Luck,
     rules: Association,
     landmarks: Landmarks,
     belief: PoseBelief,
@@ -254,7 +253,7 @@ def associate(
     """Pair detections with slots by where they are, informing the belief one by one.
 
     Args:
-        luck: of Monte Carlo association; None for the likeliest landmark.
+        luck: of each detection, for Monte Carlo association.
         rules: gates.
         landmarks: the map so far.
         belief: of the pose before the look.
@@ -274,8 +273,8 @@ def associate(
         spread = landmarks.covariance.plus(look.noise)
         whole = spread.plus(seen_from(pairing.belief, look, free))
         vacant = pairing.detection < 0
-        chance = None if luck is None else Luck(luck.table, start)
-        choice = choose(rules, look, whole, landmarks.known, vacant, chance)
+        mine = luck._replace(start=start)
+        choice = choose(rules, look, whole, landmarks.known, vacant, mine)
         matched, fresh = there & choice.matched, there & alone & choice.new
 
         at_slot = lambda tree: jax.tree.map(lambda a: a[choice.slot][None], tree)
@@ -292,6 +291,5 @@ def associate(
 
     none = jnp.full(slots.size, -1), belief, jnp.zeros(()), jnp.zeros((), int)
     order = jnp.arange(len(frame.valid))
-    starts = None if luck is None else luck.start
-    rows = order, frame.detections, frame.valid, may_start, starts
+    rows = order, frame.detections, frame.valid, may_start, luck.start
     return jax.lax.scan(one, Pairing(*none), rows)[0]

@@ -15,6 +15,7 @@ proposal is the motion model's (FastSLAM 1.0, L-SLAM); if after, it knows what w
 the belief before they were seen.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -130,7 +131,7 @@ def evidence(look: Sight, spread: Sym2) -> Float[Array, "*shape"]:
     return look.log_scale - 0.5 * (squares + jnp.log(spread.determinant()) + _LOG_2PI_2)
 
 
-_LOG_2PI_2 = 2 * 1.8378770664093453  # log (2π)², of two numbers
+_LOG_2PI_2 = 2 * math.log(2 * math.pi)  # of two numbers
 
 
 def inform(

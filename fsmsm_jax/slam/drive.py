@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-__all__ = ["Drive", "seen", "tidied"]
-
+__all__ = ["Drive", "Numbers", "seen", "tidied"]
 
 Numbers = Array | np.ndarray
 

@@ -53,7 +53,7 @@ def advance(
     frame: Drive,
     particle: Particle,
     normals: Float[Array, "3"],
-    luck: Luck | None,
+    luck: Luck,
 ) -> tuple[Particle, Pairing]:
     """One particle through one step of a drive.
 
@@ -65,7 +65,7 @@ def advance(
         frame: the step.
         particle: before.
         normals: standard normal numbers for the draws.
-        luck: of Monte Carlo association; None for the likeliest landmarks.
+        luck: of each detection, for Monte Carlo association.
 
     Returns:
         The particle after, and what became of the detections.

@@ -1,11 +1,11 @@
 r"""Landmark SLAM as a pure step: state in, state and info out.
 
-One step is the same for the whole family (`methods`): every particle is
-*moved* by the controls, draws what it draws, pairs the detections with its landmarks,
-is *informed* by them (or draws only now), corrects its map, and is *weighed* by how
-likely the detections were. If the effective number of particles 1 / Σ w² falls under
-three quarters of them, they are drawn again by weight with one comb (residual
-systematic resampling).
+One step is the same for the whole family (`methods`): every particle is *moved* by the
+controls, draws what it draws, pairs the detections with its landmarks, is *informed* by
+them (or draws only now), corrects its map, and is *weighed* by how likely the
+detections were. If the effective number of particles 1 / Σ w² falls under three
+quarters of them, they are drawn again by weight with one comb (residual systematic
+resampling).
 
 `run` is `step` under `jax.lax.scan`; keys of many seeds go through `jax.vmap`.
 
@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, ScalarLike
 from fsmsm_jax import geometry
 from fsmsm_jax.resampling import systematic
 from fsmsm_jax.slam import factored, joint
-from fsmsm_jax.slam.association import Association, Luck, luck_of
+from fsmsm_jax.slam.association import Association, luck_of
 from fsmsm_jax.slam.belief import PoseBelief
 from fsmsm_jax.slam.drive import Drive, Numbers, seen
 from fsmsm_jax.slam.factored import Particle
@@ -77,7 +77,7 @@ class State(NamedTuple):
     log_weight: Float[Array, "particles"]
     """Normalised."""
     best: Int[Array, ""]
-    """Which particle weighed most when last they differed."""
+    """Which particle weighed most in the last step, before they were drawn again."""
     key: PRNGKeyArray
     """Of the draws to come."""
 
@@ -166,12 +166,11 @@ def step(config: SlamConfig, state: State, frame: Drive) -> tuple[State, Info]:
     keeper = joint if method.joint else factored
 
     def advance(particle, normals, start):
-        mine = None if luck is None else Luck(luck.table, start)
         told = method, config.sensor, config.association, moved, frame
+        mine = luck._replace(start=start)
         return keeper.advance(*told, particle, normals, mine)
 
-    starts = None if luck is None else luck.start
-    after, pairing = jax.vmap(advance)(state.particles, normals, starts)
+    after, pairing = jax.vmap(advance)(state.particles, normals, luck.start)
     sound = _finite(after) & jnp.isfinite(pairing.log_likelihood)
     # A particle that can make no sense of the look stays as it was, without weight.
     keep = lambda a, b: jnp.where(sound.reshape(-1, *[1] * (a.ndim - 1)), a, b)

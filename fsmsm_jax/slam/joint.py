@@ -80,7 +80,7 @@ def advance(
     frame: Drive,
     particle: Joint,
     normals: Float[Array, "3"],
-    luck: Luck | None,
+    luck: Luck,
 ) -> tuple[Joint, Pairing]:
     """One particle through one step of a drive: see `factored.advance`."""
     mean, covariance, _ = particle
@@ -109,8 +109,8 @@ def advance(
             choice = Choice(slot, known[slot], ~known[slot], jnp.zeros((), bool))
             stray = jnp.zeros(())
         else:
-            chance = None if luck is None else Luck(luck.table, start)
-            choice = choose(rules, look, _spread(now, look), known, vacant, chance)
+            mine = luck._replace(start=start)
+            choice = choose(rules, look, _spread(now, look), known, vacant, mine)
             stray = astray(rules, seen, expected=method.expected)
         matched, fresh = there & choice.matched, there & alone & choice.new
         slot = choice.slot
@@ -127,8 +127,7 @@ def advance(
     lost = jnp.sum(frame.valid & (frame.ids >= slots.size)) if rules is None else 0
     none = jnp.full(slots.size, -1), jnp.zeros(()), jnp.asarray(lost, int)
     order = jnp.arange(len(ids))
-    starts = None if luck is None else luck.start
-    rows = order, frame.detections, frame.valid, may_start, ids, starts
+    rows = order, frame.detections, frame.valid, may_start, ids, luck.start
     (after, paired, likely, unplaced), _ = jax.lax.scan(one, (particle, *none), rows)
     if method.looks_first:
         both = draw(after.mean, after.covariance, method.draws, normals)

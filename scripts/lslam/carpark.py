@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from thesis.report import Table, save
 
-from fsmsm_jax.evaluation.slam import WayError, map_error, moved, paired, way_error
+from fsmsm_jax.evaluation.estimates import paired
+from fsmsm_jax.evaluation.slam import WayError, map_error, moved, way_error
 from fsmsm_jax.io.acfr import read_carpark
 from fsmsm_jax.io.landmarks import LandmarkLog
 from fsmsm_jax.plotting.slam import plot_particle_errors, plot_slam
@@ -19,7 +20,6 @@ from fsmsm_jax.slam.methods import Name
 from lslam.runs import METHODS, Found, Options, found, gain, spread, verdict
 
 SEEDS, SLOTS = 20, 60
-REACH = 11.0  # [m]: 95 % of the poles are found nearer than that
 MENDED = (1.02, 0.0063)  # what the steering should have said: see `io.acfr`
 HEAD = (
     *("particles", "method", "RMS to GPS [m]", "better than fastslam1"),
@@ -86,7 +86,7 @@ def _config(log: LandmarkLog, setting: Setting, method: Name, particles: int):
         particles=particles,
         landmarks=SLOTS,
         vehicle=replace(log.vehicle, **setting.vehicle),
-        sensor=replace(log.sensor, reach=REACH, **setting.sensor),
+        sensor=replace(log.sensor, **setting.sensor),
         association=Association(),
     )
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from thesis.report import number
 
-from fsmsm_jax.evaluation.slam import Paired
+from fsmsm_jax.evaluation.estimates import Paired
 from fsmsm_jax.slam.drive import Drive
 from fsmsm_jax.slam.filter import Info, SlamConfig, init, run
 from fsmsm_jax.slam.landmarks import Landmarks
@@ -46,7 +46,7 @@ class Found(NamedTuple):
     info: Info
     """Of all steps."""
     landmarks: Landmarks
-    """At the end, of the heaviest particle; of any if they were just drawn again."""
+    """At the end, of the particle that `State.best` names."""
 
 
 def found(config: SlamConfig, start: Numbers, keys: jax.Array, drive: Drive) -> Found:

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from thesis.report import Table, number, save
 
-from fsmsm_jax.evaluation.slam import Paired, WayError, paired, way_error
+from fsmsm_jax.evaluation.estimates import Paired, paired
+from fsmsm_jax.evaluation.slam import WayError, way_error
 from fsmsm_jax.plotting.slam import plot_particle_errors, plot_slam
 from fsmsm_jax.slam.filter import SlamConfig
 from fsmsm_jax.slam.methods import Name

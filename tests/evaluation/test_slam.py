@@ -11,7 +11,6 @@ from fsmsm_jax.evaluation.slam import (
     map_error,
     moved,
     onto,
-    paired,
     way_error,
 )
 
@@ -147,15 +146,3 @@ def test_singular_claims_are_unknown():
     some = consistency(off, covariance)
     assert np.isnan(some.average).tolist() == [True, True, False]
     assert some.mean == some.average[2]
-
-
-def test_paired_differences():
-    world = RNG.normal(size=200)  # what both have in common
-    ours, theirs = world + RNG.normal(size=200) * 0.1, world + 0.05
-    gain = paired(ours, theirs)
-    # 0.1 / √200 = 0.007, told to 5 % by 200 of them; three of it about the mean.
-    assert gain.error == pytest.approx(0.0071, rel=0.2)
-    assert gain.gain == pytest.approx(0.05, abs=0.021)
-    assert paired(ours, ours).sigmas == 0
-    with pytest.raises(ValueError, match="two or more"):
-        paired(ours[:1], theirs[:1])

@@ -125,7 +125,7 @@ def test_nothing_to_cut_is_an_error(controls, looks):
 
 def test_tables(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("# t,x\n1,2,3\n 4 \t 5 6\n\n7,nan,8\n9,1")
+    path.write_text("# t,x\n1,2,3\n 4 \t 5 6\n\n,,\n7,nan,8\n9,1")
     np.testing.assert_array_equal(
         read_table(path, 2), [[1, 2], [4, 5], [7, np.nan], [9, 1]]
     )

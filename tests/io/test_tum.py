@@ -60,6 +60,8 @@ def test_comments_and_a_torn_last_line_are_left_out(tmp_path):
         ("1 2 3\n", "line 1 is no .* 3 numbers instead of 8"),
         ("\n1 2 3 x 0 0 0 1\n", "line 2 is no .* could not convert"),
         ("1 2 3\n1 2 3 0 0 0 0 1", "line 1"),
+        ("1,2,3,0,0,0,0,1\n", "line 1 is no .* could not convert"),
+        (",,\n1 2 3 0 0 0 0 1\n", "line 1 is no .* could not convert"),
     ],
 )
 def test_what_is_no_trajectory(tmp_path, text, message):

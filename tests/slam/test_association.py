@@ -63,7 +63,9 @@ def look_at(*points, ids=None):
 @jax.jit
 def paired(rules, landmarks, frame):
     belief = PoseBelief(jnp.asarray(POSE, float), jnp.asarray(POSITION, float))
-    return associate(None, rules, landmarks, belief, SENSOR, frame, **L_SLAM)
+    luck = luck_of(jax.random.key(0), rules, 4, landmarks.evidence.size, 1)
+    mine = luck._replace(start=luck.start[0])
+    return associate(mine, rules, landmarks, belief, SENSOR, frame, **L_SLAM)
 
 
 def spread_at(point):

@@ -165,7 +165,7 @@ def test_the_evidence_has_a_gradient():
         slope = quick(jax.value_and_grad(evidence))
         at, h = jnp.array([0.01, 0.4, 0.05, 0.1]), 1e-5
         for start in (jnp.asarray(START), jnp.zeros(3)):
-            value = lambda at: slope(at, start)[0]  # noqa: B023
+            value = lambda at, start=start: slope(at, start)[0]
             slopes = [
                 (value(at + h * e) - value(at - h * e)) / (2 * h) for e in jnp.eye(4)
             ]
