@@ -21,6 +21,7 @@ A tour of the house, in the order in which data passes through it:
   `particles` keeps a cloud of poses instead of one (Monte Carlo localisation).
 - `slam`: no map at all. Landmarks found by range and bearing, and the vehicle among
   them (FastSLAM, L-SLAM, EKF-SLAM).
+- `benchmark`: how fast is it here.
 - `evaluation`, `io`, `plotting` and the `fsmsm` command line stand at the edge.
 
 Everything is a pure function of arrays and pytrees: write for one, `jax.vmap` for

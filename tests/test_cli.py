@@ -1,6 +1,8 @@
 import json
 import re
+import subprocess
 import sys
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,8 @@ import numpy as np
 import pytest
 
 from fsmsm_jax import cli
+from fsmsm_jax.io.programs import platform_here
+from fsmsm_jax.io.stored import load_tracker
 from fsmsm_jax.localisation.atlas import AtlasConfig, build_atlas
 from fsmsm_jax.sensing import Lidar, raycast
 from fsmsm_jax.world.buildings import office
@@ -164,7 +168,7 @@ def test_match_as_published_is_told_the_noise(recorded, monkeypatch):
         configs.append(config)
         raise ValueError("seen enough")
 
-    monkeypatch.setattr(sys.modules["fsmsm_jax.cli.match"], "match_scan", give_up)
+    monkeypatch.setattr(import_module("fsmsm_jax.cli.match"), "match_scan", give_up)
     assert match(recorded, "--published", "0.05", near=(-7.0, 3.9, 62.0)) == 2
     assert configs[0].levels == (2, 3, 4, 5)
     assert configs[0].finish == 0
@@ -185,6 +189,32 @@ def test_missing_files_are_named(recorded, capsys):
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("fsmsm: error: ")
         assert "missing." in line
+
+
+def test_a_command_imports_no_other_and_all_are_in_the_help(capsys):
+    code = (
+        "import sys; from fsmsm_jax import cli; cli.main(['localise', 'no', 'no']);"
+        "print(*sorted(m for m in sys.modules if m.startswith('fsmsm_jax.cli.')));"
+        "print('matplotlib' in sys.modules, 'scipy.stats' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    modules, heavy = run.stdout.splitlines()
+    assert modules == "fsmsm_jax.cli.console fsmsm_jax.cli.localise"
+    assert heavy == "False False"
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main(["--help"])
+    assert exit_info.value.code == 0
+    out = capsys.readouterr().out
+    assert all(f"• {name}" in out for name in cli.COMMANDS)
+
+
+def test_the_shell_gets_all_output_and_the_status():
+    code = "import sys; from fsmsm_jax import cli; print('told'); cli.run()"
+    command = [sys.executable, "-c", code, "localise", "missing.yaml", "missing.npz"]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 2
+    assert run.stdout == "told\n"
+    assert run.stderr.startswith("fsmsm: error: ")
 
 
 def test_wrong_usage_exits_with_status_two(capsys):
@@ -209,6 +239,17 @@ def test_help_names_every_option(capsys):
         "--atlas",
     ):
         assert option in out
+
+
+def test_export_for_another_machine_is_written_and_not_run(recorded, capsys):
+    files = [str(recorded / "map.yaml"), str(recorded / "log.npz"), "robot.fsmsm"]
+    other = "cpu" if platform_here() == "cuda" else "cuda"
+    assert cli.main(["export", *files, "--index", "1", "--platform", other]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"tracker   robot.fsmsm, \S+ MB, for 180 rays over 358°", out)
+    assert "loaded" not in out
+    with pytest.raises(ValueError, match=f"is for {other}, this is"):
+        load_tracker("robot.fsmsm")
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 import csv
 import json
 import re
-import sys
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from fsmsm_jax.sensing import Lidar, raycast
 from fsmsm_jax.world.buildings import office
 from fsmsm_jax.world.ros_map import save_map
 
-command = sys.modules["fsmsm_jax.cli.track"]
+command = import_module("fsmsm_jax.cli.track")
 STEP = jnp.array([0.08, 0.01, 0.05])
 EMPTY = 5  # the scan in which nothing is to be seen
 STAMPS = 100.0 + 0.2 * np.arange(12)

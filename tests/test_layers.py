@@ -21,6 +21,7 @@ FLOORS = {
     "evaluation": 5,
     "plotting": 5,
     "io": 5,
+    "benchmark": 5,
     "cli": 6,
     "__init__": 7,
 }

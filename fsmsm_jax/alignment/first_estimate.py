@@ -60,7 +60,7 @@ def checked(
         if maps != count:
             raise ValueError(f"expected one map or one a scan ({count}), got {maps}")
     poses[:, 2] = np.mod(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
-    return jnp.asarray(poses, scans.ranges.dtype)
+    return jax.device_put(poses.astype(scans.ranges.dtype))  # no program, see blocks
 
 
 def check_scans(scans: Scan) -> None:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from fsmsm_jax.alignment.blocks import as_batch, first, in_blocks
+from fsmsm_jax.alignment.blocks import as_batch, cut, first, in_blocks, room_for
 from fsmsm_jax.alignment.caer import caer_per_ray
 from fsmsm_jax.alignment.fast import FastConfig, fast_match
 from fsmsm_jax.alignment.first_estimate import (
@@ -36,6 +36,7 @@ from fsmsm_jax.alignment.fsmsm import fsmsm
 from fsmsm_jax.alignment.fsmsm_config import FsmsmConfig
 from fsmsm_jax.alignment.information import covariance
 from fsmsm_jax.sensing import Scan, panorama, raycast
+from fsmsm_jax.sensing.buckets import filled, padded
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 
 __all__ = ["Match", "match", "match_batch"]
@@ -110,8 +111,9 @@ def match(
         ([3.0, 2.0, 0.5], True)
 
     Note:
-        Compiled once per shape of map and scan, whatever the numbers in them or in
-        the config. Not differentiable, and not for `vmap`: see `match_batch`.
+        Compiled once per shape of map and bucket of rays (`sensing.buckets`), whatever
+        the numbers in them or in the config; batches up to 64 once per power of two.
+        Not differentiable, and not for `vmap`: see `match_batch`.
     """
     if np.ndim(scan.ranges) != 1:
         raise ValueError(
@@ -125,7 +127,8 @@ def match(
             f"a pose is [x, y, θ], three numbers [m, m, rad]; got {np.shape(pose)}"
         )
     poses = np.asarray(pose, float)[None]
-    found = match_batch(world, as_batch(scan), poses, config, rays=rays, key=key)
+    scans = as_batch(padded(scan))
+    found = match_batch(world, scans, poses, config, rays=rays, key=key)
     return first(found)
 
 
@@ -156,8 +159,12 @@ def match_batch(
         ValueError: as `match`, for any of the scans; the number of scans, poses and
             maps differs; the scans differ in `range_max`.
     """
-    poses = checked(worlds, scans, poses, rays)
-    starts = into_the_open(worlds, poses, config.box)
+    given = checked(worlds, scans, poses, rays)
+    # Few shapes: rays that say nothing, and the last scan again, fill the batch up.
+    count, room = len(given), room_for(len(given))
+    scans, given = jax.device_put(filled((padded(scans), given), room))
+    worlds = worlds if one_world(worlds) else jax.device_put(filled(worlds, room))
+    starts = into_the_open(worlds, given, config.box)
     panoramas = _panoramas(scans, rays)
     if isinstance(config, FsmsmConfig) and config.orientation != _CAN_MASK:
         missing = int(np.max(np.sum(~np.asarray(panoramas.valid), axis=-1)))
@@ -172,8 +179,9 @@ def match_batch(
         found = _by_fsmsm(worlds, scans, panoramas, starts, config, key)
     shared = worlds if one_world(worlds) else None
     own = None if one_world(worlds) else worlds
-    jobs = (own, scans, panoramas, poses, starts, found)
-    return in_blocks(lambda block: _match(shared, block, config), jobs, len(poses))
+    jobs = (own, scans, panoramas, given, starts, found)
+    found = in_blocks(lambda block: _match(shared, block, config), jobs, room)
+    return cut(found, count)
 
 
 _panoramas = jax.jit(jax.vmap(panorama, (0, None)), static_argnums=1)

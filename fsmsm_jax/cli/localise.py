@@ -1,10 +1,12 @@
 """`fsmsm localise`: where on the map was this scan taken?"""
 
 import sys
+import time
 from json import dumps
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import numpy as np
 import tyro
 
@@ -15,10 +17,14 @@ from fsmsm_jax.cli.console import (
     summary,
     tell_remarks,
     timed,
+    without_tracing,
 )
 from fsmsm_jax.io.logs import read_scans
+from fsmsm_jax.io.stored import ANSWER
+from fsmsm_jax.localisation import search
 from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas, build_atlas
-from fsmsm_jax.localisation.search import Localisation, localise as localise_scan
+from fsmsm_jax.localisation.search import Localisation, SearchConfig
+from fsmsm_jax.sensing.buckets import padded
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.ros_map import load_map
@@ -32,8 +38,9 @@ def localise(
     topic: str | None = None,
     json: bool = False,
     picture: Path = Path("localise.png"),
-    spacing: float = 0.4,
+    spacing: float = 0.8,
     atlas: Path | None = None,
+    max_memory: float = np.inf,
 ) -> None:
     """Say where on a map one scan of a log was taken.
 
@@ -46,12 +53,15 @@ def localise(
         picture: where to write the picture; none for no picture.
         spacing: distance between the positions of the atlas in metres.
         atlas: file that keeps the atlas: loaded if it is there, else built and saved.
+        max_memory: megabytes that the atlas may hold.
     """
     world = load_map(map)
     scans = read_scans(log, topic)
     tell_remarks(scans)
     scan = scans.scan(index)
-    scan_atlas, atlas_time = timed(lambda: load_or_build_atlas(world, spacing, atlas))
+    scan_atlas, atlas_time = timed(
+        lambda: load_or_build_atlas(world, spacing, atlas, max_memory)
+    )
     result, first, warm = localise_twice(scan_atlas, scan)
     timing = {"atlas": atlas_time, "first_query": first, "query": warm}
     if json:
@@ -66,22 +76,36 @@ def localise(
 
 
 def load_or_build_atlas(
-    world: OccupancyGrid, spacing: float, path: Path | None
+    world: OccupancyGrid, spacing: float, path: Path | None, max_memory: float = np.inf
 ) -> ScanAtlas:
-    """The atlas in the file, or a new one, which then goes into the file."""
-    if path is not None and path.exists():
-        return ScanAtlas.load(path, world)
-    atlas = build_atlas(world, AtlasConfig(spacing=spacing), progress=True)
-    if path is not None:
-        atlas.save(path)
+    """The atlas in the file, or a new one, which then goes into the file.
+
+    Raises:
+        ValueError: it cannot be read or built, or is larger than so many megabytes.
+    """
+    if path is None or not path.exists():
+        config = AtlasConfig(spacing=spacing)
+        cap = 1e6 * max_memory
+        return build_atlas(world, config, max_memory=cap, progress=True, file=path)
+    atlas = ScanAtlas.load(path, world)
+    if atlas.nbytes > 1e6 * max_memory:
+        raise ValueError(
+            f"the atlas in {path} holds {atlas.nbytes / 1e6:.1f} MB and may hold "
+            f"{max_memory:g}; remove it, and a new one will be built"
+        )
     return atlas
 
 
 def localise_twice(atlas: ScanAtlas, scan: Scan) -> tuple[Localisation, float, float]:
     """The result, and the seconds of a query with compilation and of one without."""
-    result, first = timed(lambda: localise_scan(atlas, scan))
-    _, warm = timed(lambda: localise_scan(atlas, scan))
-    return result, first, warm
+    search.check_echoes(scan, atlas.config.reach)
+    start = time.perf_counter()
+    asked = atlas, padded(scan), SearchConfig()
+    query = without_tracing(search.query, asked, ANSWER)
+    result = jax.block_until_ready(query())
+    first = time.perf_counter() - start
+    _, warm = timed(query)
+    return jax.device_get(result), first, warm
 
 
 def report(result: Localisation, timing: dict[str, float]) -> str:
@@ -132,6 +156,6 @@ def _as_json(result: Localisation, timing: dict[str, float]) -> dict:
 
 def draw_localisation(path: Path, world, scan: Scan, result: Localisation, truth=None):
     """The picture of `plot_localisation`, in a file."""
-    from fsmsm_jax.plotting import plot_localisation
+    from fsmsm_jax.plotting.localisation import plot_localisation
 
     save_picture(path, lambda ax: plot_localisation(ax, world, scan, result, truth))

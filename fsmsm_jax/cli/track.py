@@ -47,7 +47,7 @@ def track(
     no_odometry: bool = False,
     sweep: Literal["none", "stated", "reversed"] = "none",
     json: bool = False,
-    spacing: float = 0.4,
+    spacing: float = 0.8,
     atlas: Path | None = None,
 ) -> None:
     """Say where on a map the lidar was, scan by scan, through a whole log.

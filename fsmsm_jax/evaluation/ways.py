@@ -50,10 +50,11 @@ def plan(
     """
     if not (math.isfinite(clearance) and clearance > 0):
         raise ValueError(f"clearance must be a positive length [m], got {clearance}")
-    lattice = lattice_over(world, clearance / 4, 0.0)
-    nodes = np.asarray(lattice.positions, float)
-    dear = np.asarray(_dearness(world, lattice.positions, clearance))
-    dear = np.where(lattice.allowed, dear, np.inf)
+    lattice, allowed = lattice_over(world, clearance / 4, 0.0)
+    positions = lattice.to_map(*jnp.indices(allowed.shape))
+    nodes = np.asarray(positions, float)
+    dear = np.asarray(_dearness(world, positions, clearance))
+    dear = np.where(allowed, dear, np.inf)
     graph = _graph(dear, clearance / 4)
     points = nodes.reshape(-1, 2).astype(float)
     ends = []

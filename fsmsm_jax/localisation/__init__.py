@@ -12,6 +12,12 @@ from fsmsm_jax.localisation.search import (
     localise as localise,
     localise_batch as localise_batch,
 )
+from fsmsm_jax.localisation.stream import (
+    Answer as Answer,
+    Query as Query,
+    localise_stream as localise_stream,
+)
+from fsmsm_jax.localisation.fleet import Fleet as Fleet
 from fsmsm_jax.localisation.motion import OdometryModel as OdometryModel
 from fsmsm_jax.localisation import tracker as tracker
 from fsmsm_jax.localisation.tracker import TrackerConfig as TrackerConfig

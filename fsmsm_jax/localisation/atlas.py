@@ -1,35 +1,38 @@
 """The map is scanned once, not once per query.
 
-A `ScanAtlas` lays a square lattice over the map's free space and keeps, of each
-position, the panoramic scan that a lidar would take there. Turning the sensor only
-shifts that scan, so one panorama stands for all headings: hypotheses are positions.
+A `ScanAtlas` lays a square lattice over the map's free space and takes a panoramic scan
+from each position. Turning the sensor only shifts that scan, so one panorama stands for
+all headings: hypotheses are positions. Of map and panoramas it keeps what makes a query
+a handful of FFTs:
 
-Two spectra make a query a handful of FFTs:
+- `tiles.spectra`: two-dimensional DFTs of the map's likelihood field exp(−d²/2σ²), d
+  being the distance to the nearest wall. The product with the spectrum of the scan's
+  end points scores *every* lattice position at one heading (`correlative`).
+- `tiles.shells`: how many rays of each panorama end how far away, a byte each. That
+  does not change when the sensor turns, and rules places out before anything is
+  correlated (`shells`).
 
-- `end_points`: the two-dimensional DFT of the map's likelihood field
-  exp(−d²/2σ²), d being the distance to the nearest wall. The product with the
-  spectrum of the scan's end points scores *every* lattice position at one heading.
-- `panoramas`: the one-dimensional DFTs of the panoramas, their ranges written as
-  phases e^{iω log(r + r₀)}. The product with the real panorama's spectrum scores
-  *every* heading at one position. As a phase each ray has weight one: a long ray
-  cannot outvote fifty short ones, as it does when metres are correlated.
-
-Building is chunked; what it will cost is said before (`memory_estimate`).
+The lattice is coarse; what survives on it descends on the map itself (`search`).
+Building is chunked; what it will cost is said before (`memory_estimate`), and a cap on
+it is kept.
 """
 
+import dataclasses
 import hashlib
-import zipfile
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
-from scipy import fft
+from jax.sharding import Mesh
 from tqdm import tqdm
 
+from fsmsm_jax import geometry
+from fsmsm_jax.localisation.array_file import UNREADABLE, read_arrays, write_arrays
 from fsmsm_jax.localisation.lattice import Lattice, lattice_over
+from fsmsm_jax.localisation.shells import bins, shells
+from fsmsm_jax.localisation.tiles import Cut, Tiles, cut, likelihood_spectra, spread
 from fsmsm_jax.sensing.raycast import raycast
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
@@ -39,40 +42,38 @@ __all__ = [
     "ScanAtlas",
     "build_atlas",
     "memory_estimate",
-    "range_phases",
 ]
 
-_FREQUENCY = 4.0  # ω: ranges that differ by a factor of two differ by 2.8 rad
-_OFFSET = 0.3  # r₀ [m]: below this, differences of range are clutter
 _CHUNK = 1024  # positions cast together
-_UNREADABLE = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
+_VERSION = 2  # of the file; 1 held spectra of panoramas, and no tiles
+_OF_TILES = ("spectra", "corner", "allowed", "shells")
+_TRIES = 8  # of spacings, where a cap is too small
 
 
 class AtlasConfig(eqx.Module):
     """How finely the map is scanned."""
 
-    spacing: float = eqx.field(static=True, default=0.4)
+    spacing: float = eqx.field(static=True, default=0.8)
     """Distance between lattice positions [m]."""
     rays: int = eqx.field(static=True, default=180)
-    """Rays of each panorama."""
-    range_max: float = eqx.field(static=True, default=30.0)
-    """Longest range of the panoramas [m]."""
+    """Rays of each panorama, 255 at most."""
     reach: float = eqx.field(static=True, default=15.0)
     """End points farther than this from the sensor do not vote in the search [m]."""
-    softness: float = eqx.field(static=True, default=0.35)
+    softness: float = eqx.field(static=True, default=0.5)
     """σ of the likelihood field [m]: about a spacing, so that no wall slips through."""
     margin: float = eqx.field(static=True, default=1.0)
     """How far into unknown space a sensor may stand [m]."""
 
     def __check_init__(self):
         """Refuse settings that no lattice can be built with."""
-        for name in ("spacing", "range_max", "reach", "softness"):
+        for name in ("spacing", "reach", "softness"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be a positive length [m], got {value}")
-        if self.rays < 8 or not self.margin >= 0:
+        if not 8 <= self.rays <= 255 or not self.margin >= 0:
             raise ValueError(
-                f"expected rays ≥ 8 and margin ≥ 0, got {self.rays} and {self.margin}"
+                "expected 8 ≤ rays ≤ 255 and margin ≥ 0, got "
+                f"{self.rays} and {self.margin}"
             )
 
 
@@ -83,175 +84,220 @@ class ScanAtlas(eqx.Module):
     """The map itself."""
     lattice: Lattice
     """Where the map was scanned from."""
-    row_of: Int[Array, "rows columns"]
-    """Index into `panoramas` of each node; of a neighbour where none may stand."""
-    panoramas: Complex[Array, "positions rays"]
-    """DFT of each panorama's e^{iω log(r + r₀)}, ray n at bearing −π + 2πn/rays."""
-    end_points: Complex[Array, "height half_width"]
-    """Half-spectrum of the zero-padded likelihood field."""
+    tiles: Tiles
+    """What is known of each position, and of the walls around."""
     config: AtlasConfig = eqx.field(static=True)
-
-    @property
-    def padded_shape(self) -> tuple[int, int]:
-        """Size of the field whose spectrum `end_points` is."""
-        return _padded_shape(self.lattice.allowed.shape, self.config)
 
     def save(self, path: str | Path) -> None:
         """Write the atlas, less the map it belongs to, as an `.npz` file."""
-        with Path(path).open("wb") as file:
-            np.savez(
-                file,
-                fingerprint=np.asarray(_fingerprint(self.world)),
-                frame=self.lattice.frame,
-                allowed=self.lattice.allowed,
-                panoramas=self.panoramas,
-                end_points=self.end_points,
-                **{  # pyright: ignore[reportArgumentType]: keyword names, not options
-                    f"config_{name}": np.asarray(value)
-                    for name, value in vars(self.config).items()
-                },
-            )
+        tiles = {name: getattr(self.tiles, name) for name in _OF_TILES}
+        pieces = [np.asarray(tiles.pop("shells"))]
+        _write(path, self.world, self.lattice, self.config, tiles, pieces)
 
     @classmethod
-    def load(cls, path: str | Path, world: OccupancyGrid | PolygonMap) -> "ScanAtlas":
+    def load(
+        cls,
+        path: str | Path,
+        world: OccupancyGrid | PolygonMap,
+        mesh: Mesh | None = None,
+    ) -> "ScanAtlas":
         """Read an atlas that was saved for this very map.
 
+        Args:
+            path: the file.
+            world: the map.
+            mesh: devices to spread it over; on one device if left out.
+
         Raises:
-            ValueError: the file is missing or no atlas, or was built for another map.
+            ValueError: the file is missing, no atlas, torn or changed, of another
+                version, or was built for another map.
         """
-        names = list(AtlasConfig.__dataclass_fields__)
+        anew = "build it anew with build_atlas(world) and save it"
         try:
-            with Path(path).open("rb") as file, np.load(file) as saved:
-                fingerprint = str(saved["fingerprint"])
-                config = AtlasConfig(**{k: saved[f"config_{k}"].item() for k in names})
-                arrays = {
-                    k: saved[k] for k in ("frame", "allowed", "panoramas", "end_points")
-                }
-        except _UNREADABLE as error:
+            kept = read_arrays(Path(path))
+            version = int(kept["version"]) if "version" in kept else 1
+            if version != _VERSION:
+                raise ValueError(f"it is of version {version}, not {_VERSION}")
+            names = AtlasConfig.__dataclass_fields__
+            config = AtlasConfig(**{k: kept[f"config_{k}"].item() for k in names})
+            fingerprint = str(kept["fingerprint"])
+            lattice = Lattice(jnp.asarray(kept["frame"]), config.spacing)
+            tiles = [kept[name] for name in _OF_TILES]
+        except UNREADABLE as error:
             raise ValueError(
-                f"cannot read a scan atlas from {path} ({error}); "
-                "build it anew with build_atlas(world) and save it"
+                f"cannot read a scan atlas from {path} ({error}); {anew}"
             ) from error
-        expected = (int(arrays["allowed"].sum()), config.rays)
-        if arrays["panoramas"].shape != expected:
-            raise ValueError(
-                f"the atlas {path} is damaged: expected panoramas of shape {expected}, "
-                f"got {arrays['panoramas'].shape}; build it anew with build_atlas"
-            )
         if fingerprint != _fingerprint(world):
             raise ValueError(
                 f"the atlas {path} was built for another map, or other settings of it; "
                 "load that map, or build a new atlas for this one with build_atlas"
             )
-        lattice = Lattice(
-            jnp.asarray(arrays["frame"]), jnp.asarray(arrays["allowed"]), config.spacing
-        )
         return cls(
-            world=world,
+            world=_roomy(world),
             lattice=lattice,
-            row_of=_row_of(arrays["allowed"]),
-            panoramas=jnp.asarray(arrays["panoramas"]),
-            end_points=jnp.asarray(arrays["end_points"]),
+            tiles=spread(tiles, mesh) if mesh else Tiles(*map(jnp.asarray, tiles)),
             config=config,
         )
+
+    def spread(self, mesh: Mesh) -> "ScanAtlas":
+        """The same atlas with its tiles shared out over the devices of a mesh.
+
+        `localise` is called as before. With several processes each makes or loads the
+        atlas, spreads it over a mesh of all devices, and calls `localise` with the same
+        scans in the same order; the map itself stays on each process's first device.
+        """
+        tiles = spread(jax.tree.leaves(self.tiles), mesh)
+        return eqx.tree_at(lambda atlas: atlas.tiles, self, tiles)
+
+    @property
+    def nbytes(self) -> int:
+        """What it holds beside the map [bytes]."""
+        return sum(a.nbytes for a in jax.tree.leaves(self.tiles))
 
 
 def memory_estimate(
     world: OccupancyGrid | PolygonMap, config: AtlasConfig = AtlasConfig()
 ) -> int:
     """Bytes that the atlas of this world will hold, without building it."""
-    return _bytes(lattice_over(world, config.spacing, config.margin), config)
+    _, allowed = lattice_over(world, config.spacing, config.margin)
+    return _cut(allowed, config).bytes(bins(config.reach))
 
 
 def build_atlas(
     world: OccupancyGrid | PolygonMap,
     config: AtlasConfig = AtlasConfig(),
     *,
+    max_memory: float = np.inf,
     progress: bool = False,
+    file: str | Path | None = None,
 ) -> ScanAtlas:
     """Scan the map from every lattice position.
 
     Args:
         world: the map.
         config: how finely.
+        max_memory: bytes that the atlas may hold, the map itself not counted.
         progress: whether to draw a progress bar on stderr.
+        file: where to write the atlas while it is made, for one that would not fit
+            into memory twice; None to make it in memory, and `save` or not.
 
     Raises:
-        ValueError: no lattice position lies in free space.
+        ValueError: no lattice position lies in free space, or the atlas would be larger
+            than it may (said before anything is cast, with the spacing that would fit).
 
     Example:
         >>> import fsmsm_jax as fj
         >>> room = fj.PolygonMap.from_outlines([[1, 1], [5, 1], [5, 4], [1, 4]])
         >>> atlas = build_atlas(room, AtlasConfig(spacing=0.5, margin=0.0))
-        >>> atlas.panoramas.shape
-        (48, 180)
+        >>> int(atlas.tiles.allowed.sum())  # positions
+        48
     """
-    lattice = lattice_over(world, config.spacing, config.margin)
-    position = lattice.positions[lattice.allowed]
-    count = len(position)
-    padded = jnp.pad(position, ((0, -count % _CHUNK), (0, 0)), mode="edge")
-    cost = f"atlas of {count} positions, {_bytes(lattice, config) / 1e6:.0f} MB"
-    batches = tqdm(
-        jnp.split(padded, len(padded) // _CHUNK), desc=cost, disable=not progress
+    lattice, allowed = lattice_over(world, config.spacing, config.margin)
+    layout = _cut(allowed, config)
+    cost = layout.bytes(bins(config.reach))
+    if cost > max_memory:
+        fits = _spacing_that_fits(world, config, cost, max_memory)
+        raise ValueError(
+            f"the atlas of spacing {config.spacing:g} m needs {cost / 1e6:.1f} MB and "
+            f"may have {max_memory / 1e6:.1f} MB; {fits}"
+        )
+    corner, size = jnp.asarray(layout.corner), jnp.asarray(allowed.shape)
+    spectra = likelihood_spectra(
+        world, lattice, size, corner, config.softness, side=layout.side, rim=layout.rim
     )
-    panoramas = [_panoramas_from(world, batch, config) for batch in batches]
-    return ScanAtlas(
-        world=world,
-        lattice=lattice,
-        row_of=_row_of(np.asarray(lattice.allowed)),
-        panoramas=jnp.concatenate(panoramas)[:count],
-        end_points=_end_point_spectrum(world, lattice, config),
-        config=config,
-    )
+    tiles = {
+        "spectra": spectra,
+        "corner": corner,
+        "allowed": jnp.asarray(layout.allowed),
+    }
+    positions = int(layout.allowed.sum())
+    label = f"atlas of {positions} positions, {cost / 1e6:.0f} MB"
+    with tqdm(total=positions, desc=label, disable=not progress) as bar:
+        pieces = (
+            _shells_of(world, lattice, *tile, config, bar)
+            for tile in zip(layout.corner, layout.allowed, strict=True)
+        )
+        if file is None:
+            told = jnp.asarray(np.concatenate(list(pieces)))
+            tiles = Tiles(**tiles, shells=told)
+            return ScanAtlas(_roomy(world), lattice, tiles, config)
+        _write(file, world, lattice, config, tiles, pieces)
+    return ScanAtlas.load(file, world)
+
+
+def _roomy(world):
+    """The map in arrays of rounded sizes, so that maps share compiled programs."""
+    return world.padded() if isinstance(world, OccupancyGrid) else world
+
+
+def _write(path, world, lattice, config, tiles, pieces):
+    """The file of an atlas, of which the tiles' shells come in pieces."""
+    small = {
+        "version": _VERSION,
+        "fingerprint": _fingerprint(world),
+        **{f"config_{name}": value for name, value in vars(config).items()},
+        "frame": lattice.frame,
+        **tiles,
+    }
+    small = {name: np.asarray(value) for name, value in small.items()}
+    shape = *small["allowed"].shape, bins(config.reach)
+    write_arrays(Path(path), small, "shells", shape, np.dtype(np.uint8), pieces)
+
+
+def _shells_of(world, lattice, corner, allowed, config, bar):
+    """Shells of one tile's nodes (1, core, core, bins), cast chunk by chunk."""
+    row, column = np.nonzero(allowed)
+    found = np.zeros((1, *allowed.shape, bins(config.reach)), np.uint8)
+    for start in range(0, len(row), _CHUNK):
+        here = slice(start, start + _CHUNK)
+        count = len(row[here])
+        nodes = np.stack([row[here], column[here]]) + corner[:, None]
+        nodes = np.pad(nodes, ((0, 0), (0, _CHUNK - count)), mode="edge")
+        seen = _shells_from(world, lattice.frame, nodes, config)
+        found[0, row[here], column[here]] = np.asarray(seen)[:count]
+        bar.update(count)
+    return found
 
 
 @jax.jit
-def _panoramas_from(world, positions, config):
-    """Spectra of the panoramas seen from a chunk of positions."""
+def _shells_from(world, frame, nodes, config):
+    offset = (nodes[::-1].T + 0.5) * config.spacing
+    poses = jnp.pad(geometry.transform_points(frame, offset), ((0, 0), (0, 1)))
     bearings = -jnp.pi + 2 * jnp.pi * jnp.arange(config.rays) / config.rays
-    poses = jnp.pad(positions, ((0, 0), (0, 1)))
-    cast = lambda pose: raycast(world, pose, bearings, config.range_max)
-    return jnp.fft.fft(range_phases(jax.vmap(cast)(poses)))
+    # A little beyond the reach, so that what is at the limit is in no shell.
+    cast = lambda pose: raycast(world, pose, bearings, config.reach + 1.0)
+    return jax.vmap(lambda pose: shells(cast(pose), config.reach))(poses)
 
 
-def range_phases(ranges: Float[Array, "*batch rays"]) -> Complex[Array, "*batch rays"]:
-    """Ranges [m] as unit phases e^{iω log(r + r₀)}: every ray has the same vote."""
-    return jnp.exp(1j * _FREQUENCY * jnp.log(ranges + _OFFSET))
+def _cut(allowed, config) -> Cut:
+    return cut(allowed, int(np.ceil(config.reach / config.spacing)))
 
 
-@jax.jit
-def _end_point_spectrum(world, lattice, config):
-    """Half-spectrum of exp(−d²/2σ²) at the lattice's nodes."""
-    distance = world.distance_at(lattice.positions)
-    likelihood = jnp.exp(-0.5 * (distance / config.softness) ** 2)
-    return jnp.fft.rfft2(likelihood, s=_padded_shape(likelihood.shape, config))
-
-
-def _bytes(lattice, config) -> int:
-    """Size of the two spectra: eight bytes a complex number."""
-    height, width = _padded_shape(lattice.allowed.shape, config)
-    positions = int(lattice.allowed.sum())
-    return 8 * (positions * config.rays + height * (width // 2 + 1))
-
-
-def _padded_shape(shape, config) -> tuple[int, int]:
-    """Room beyond the map, rounded up to lengths that FFTs like.
-
-    The correlation is circular: end points farther than this off the map come round
-    to its other side. Half the reach is enough, for a right pose has none out there.
-    """
-    reach = int(np.ceil(0.5 * config.reach / config.spacing)) + 2
-    rows, columns = (fft.next_fast_len(n + reach, real=True) for n in shape)
-    return rows, columns  # pyright: ignore[reportReturnType]: scipy's stub says None
-
-
-def _row_of(allowed):
-    return jnp.asarray(np.maximum(np.cumsum(allowed) - 1, 0).reshape(allowed.shape))
+def _spacing_that_fits(world, config, size, allowed) -> str:
+    """What to do about an atlas that is too large: its bytes go with 1 / spacing²."""
+    spacing = config.spacing
+    for _ in range(_TRIES):
+        spacing = round(spacing * max(1.05, 1.02 * np.sqrt(size / allowed)), 2)
+        coarser = dataclasses.replace(config, spacing=spacing)
+        try:
+            size = memory_estimate(world, coarser)
+        except ValueError:  # no position left
+            break
+        if size <= allowed:
+            return f"a spacing of {spacing:g} m would fit, with {size / 1e6:.1f} MB"
+    return "no spacing would fit; fewer rays, or more memory"
 
 
 def _fingerprint(world) -> str:
     """A digest of everything in the world that a virtual scan depends on."""
     digest = hashlib.sha256(type(world).__name__.encode())
-    for leaf in jax.tree.leaves(world):
+    if isinstance(world, OccupancyGrid):  # the other fields follow from these
+        rows, columns = (int(side) for side in world.extent)  # whether padded or not
+        clearance = np.asarray(world.clearance)[: rows + 2, : columns + 2]
+        cells = np.asarray(world.cells)[:rows, :columns]
+        told = (cells, world.resolution, world.origin, clearance)
+    else:
+        told = (world.start, world.end, world.solid)
+    for leaf in jax.tree.leaves(told):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()

@@ -34,6 +34,7 @@ from fsmsm_jax.localisation.contest import (
 )
 from fsmsm_jax.localisation.search import Localisation, SearchConfig, localise
 from fsmsm_jax.localisation.tracker import TrackerConfig, TrackerInfo, TrackerState
+from fsmsm_jax.sensing.buckets import padded, padded_rays
 from fsmsm_jax.sensing.lidar import Scan
 
 __all__ = ["Fix", "FollowConfig", "Reading", "follow"]
@@ -106,7 +107,8 @@ def follow(
 
     Args:
         atlas: of the map.
-        readings: scans as they come, of one number of rays; with odometry or without.
+        readings: scans as they come, with odometry or without; of any number of rays,
+            but each bucket of them (`sensing.buckets`) is compiled on its own.
         initial: pose of the lidar at the first scan [m, m, rad], to some decimetres;
             without, it is found.
         config: settings.
@@ -134,6 +136,10 @@ def follow(
             if not np.isfinite(origin).all():
                 origin = counted * [1.0, 1.0, 0.0]
             reading = reading._replace(odometry=jnp.asarray(counted - origin))
+        scan, moments = padded(reading.scan), reading.moments
+        if moments is not None:
+            moments = padded_rays(moments, len(scan.ranges))
+        reading = reading._replace(scan=scan, moments=moments)
         go_on = _track if isinstance(robot, TrackerState) else _search
         robot, fix = go_on(atlas, robot, reading, config)
         yield fix

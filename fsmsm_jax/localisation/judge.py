@@ -28,13 +28,16 @@ from fsmsm_jax.sensing.raycast import raycast
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
 
-__all__ = ["Evidence", "explain", "trust"]
+__all__ = ["Evidence", "explain", "on_walls", "trust"]
 
 _SIGMA = 0.1  # [m]: map and sensor errors of a ray that the map does explain
 _UNMAPPED, _TOO_SHORT, _TOO_LONG = 0.3, 0.1, 0.05  # ε, by what may have happened
 _NO_ECHO_WEIGHT = 0.1  # glass, black things and sky make missing echoes poor witnesses
 _THICKEST = 0.06  # [m]: walls drawn thicker than this are another place's walls
 _EXPLAINED = 0.3  # [m]: a ray that reads or ends this close to the map fits it
+_NEAR = 0.15  # [m]: σ of "on a wall" before the pose is polished
+_ON_THE_WAY = (0.3, 0.55, 0.8)  # where along a ray its free space is probed
+_CLEAR_OF_WALL = 0.75  # [m]: probes nearer to the end point would feel its wall
 _LEAD = 0.15  # lead of a sure answer over its best rival [nats a ray]
 _LEAD_PER_DOUBT = 0.75  # more of it per nat that the answer itself falls short
 _MOST = 0.6  # share of the rays that a sure answer explains
@@ -98,6 +101,34 @@ def explain(
         through=mean(~fits & scan.echo & (e > 0) & ~world.unknown_at(end), scan.valid),
         caer_per_ray=mean(jnp.abs(e), both),
     )
+
+
+def on_walls(
+    world: OccupancyGrid | PolygonMap, scan: Scan, pose: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """A first judgement, without casting: do rays end on walls, and on none before?
+
+    Args:
+        world: the map.
+        scan: the real scan.
+        pose: where the lidar may have been [m, m, rad].
+
+    Returns:
+        At most 1: the weight of the echoes that end on walls, less half that of rays
+        whose way leads along or through some.
+    """
+    say = jnp.clip(scan.ranges, 0.3, 10.0) ** 0.25
+    say = say / jnp.maximum(jnp.sum(jnp.where(scan.echo, say, 0.0)), 1e-6)
+    turned = pose[2] + scan.bearings
+    along = scan.ranges[:, None] * jnp.stack([jnp.cos(turned), jnp.sin(turned)], axis=1)
+    near = lambda share: jnp.exp(
+        -0.5 * (world.distance_at(pose[None, :2] + share * along) / _NEAR) ** 2
+    )
+    score = jnp.where(scan.echo, near(1.0), 0.0)
+    for share in _ON_THE_WAY:
+        clear = scan.valid & ((1 - share) * scan.ranges > _CLEAR_OF_WALL)
+        score -= jnp.where(clear, 0.5 / len(_ON_THE_WAY) * near(share), 0.0)
+    return jnp.sum(say * score)
 
 
 def trust(

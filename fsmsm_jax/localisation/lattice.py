@@ -24,8 +24,6 @@ class Lattice(eqx.Module):
 
     frame: Float[Array, "3"]
     """Pose of the lattice's lower left corner in the map [m, m, rad]."""
-    allowed: Bool[Array, "rows columns"]
-    """Nodes where a sensor may stand."""
     spacing: float = eqx.field(static=True)
     """Distance between nodes [m]; node (0, 0) lies half of it inside the corner."""
 
@@ -36,17 +34,11 @@ class Lattice(eqx.Module):
         offset = (jnp.stack([column, row], axis=-1) + 0.5) * self.spacing
         return geometry.transform_points(self.frame, offset)
 
-    @property
-    def positions(self) -> Float[Array, "rows columns 2"]:
-        """Map-frame positions of all nodes [m]."""
-        row, column = jnp.indices(self.allowed.shape)
-        return self.to_map(row, column)
-
 
 def lattice_over(
     world: OccupancyGrid | PolygonMap, spacing: float, margin: float
-) -> Lattice:
-    """The lattice over the known part of a map.
+) -> tuple[Lattice, Bool[np.ndarray, "rows columns"]]:
+    """The lattice over the known part of a map, and its nodes where one may stand.
 
     Args:
         world: the map.
@@ -63,14 +55,14 @@ def lattice_over(
         frame = jnp.asarray([*ends.min(axis=0), 0.0], float)
         size, may_stand = np.ptp(ends, axis=0), world.contains
     columns, rows = np.maximum(np.ceil(size / spacing - 1e-6).astype(int), 1)
-    lattice = Lattice(frame, jnp.ones((rows, columns), bool), spacing)
-    allowed = may_stand(lattice.positions)
-    if not np.asarray(allowed).any():
+    lattice = Lattice(frame, spacing)
+    allowed = np.asarray(may_stand(lattice.to_map(*jnp.indices((rows, columns)))))
+    if not allowed.any():
         raise ValueError(
             f"no lattice position of spacing {spacing} m lies in free space; choose a "
             "smaller spacing, or check the map's thresholds if none of it is free"
         )
-    return Lattice(frame, jnp.asarray(allowed), spacing)
+    return lattice, allowed
 
 
 def _over_grid(world, spacing, margin):
@@ -92,7 +84,7 @@ def _over_grid(world, spacing, margin):
     def may_stand(points):
         cell = np.floor(np.asarray(world.to_cells(points))).astype(int)
         column, row = np.moveaxis(cell, -1, 0)
-        height, width = stand.shape
+        height, width = (int(side) for side in world.extent)
         on_map = (0 <= row) & (row < height) & (0 <= column) & (column < width)
         return on_map & stand[row.clip(0, height - 1), column.clip(0, width - 1)]
 

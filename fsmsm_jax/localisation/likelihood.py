@@ -115,7 +115,7 @@ def _distances(world, scan, poses):
             jax.vmap(geometry.transform_points, (0, None))(poses, points)
         )
     # In the grid's frame and in cells, x and y apart: one gather from the nearest cell.
-    height, width = world.cells.shape
+    height, width = world.extent
     x, y = (world.to_cells(poses[:, :2])).T
     local = poses[:, 2] - world.origin[2]
     c, s = jnp.cos(local)[:, None], jnp.sin(local)[:, None]
@@ -123,5 +123,6 @@ def _distances(world, scan, poses):
     column = jnp.floor(x[:, None] + c * px - s * py).astype(int)
     row = jnp.floor(y[:, None] + s * px + c * py).astype(int)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    cell = jnp.clip(row, 0, height - 1) * width + jnp.clip(column, 0, width - 1)
+    cell = jnp.clip(row, 0, height - 1) * world.cells.shape[1]
+    cell += jnp.clip(column, 0, width - 1)
     return jnp.where(inside, world.distance.reshape(-1)[cell], jnp.inf)

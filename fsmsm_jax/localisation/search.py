@@ -2,17 +2,21 @@
 
 `localise` goes from everything to one in five steps, each a batch:
 
-1. **rank** every lattice position at every heading by end points (`correlative`);
-2. **turn** the best to the heading that the atlas's panoramas ask for, by one masked
-   circular correlation each, and rank again with its similarity;
-3. **descend** each survivor onto the walls by its end points (`alignment.fit`);
-4. **judge** each by what the map explains of each ray (`judge`), drop near
-   duplicates, and polish the best few by their ranges, on the exact derivative;
+1. **rule out** the lattice positions whose ranges do not fit, turned any way
+   (`shells`), and **rank** what is left, at every heading, by end points
+   (`correlative`);
+2. **descend** from the best thousands onto the walls with few rays, and from what fits
+   best there with more (`alignment.fit`);
+3. **judge** each by what the map explains of each ray (`judge`), and drop near
+   duplicates;
+4. **polish** the best by their ranges, on the exact derivative, and judge again;
 5. **report** pose, covariance, CAER per ray, the runners-up, and whether the best
    is so much better than any other place that it can be trusted.
 
-The number of candidates falls at each step and the rays per candidate grow. All
-shapes are fixed, so one compilation serves every scan of a sensor.
+The lattice is coarse, and the end points' basin is wide: half a spacing and half a step
+of heading are mended by three Gauss-Newton steps, which cost less than a finer lattice
+and lose less. The number of candidates falls at each step and the rays per candidate
+grow. All shapes are fixed, so one compilation serves every scan of a sensor.
 """
 
 from typing import NamedTuple
@@ -24,42 +28,57 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fsmsm_jax import geometry
+from fsmsm_jax.alignment.blocks import cut, room_for
 from fsmsm_jax.alignment.fit import descend_end_points, fit_ranges, polish_ranges
 from fsmsm_jax.alignment.information import covariance
-from fsmsm_jax.localisation.atlas import ScanAtlas, range_phases
+from fsmsm_jax.localisation.atlas import ScanAtlas
 from fsmsm_jax.localisation.correlative import rank_poses
-from fsmsm_jax.localisation.judge import Evidence, explain, trust
+from fsmsm_jax.localisation.judge import Evidence, explain, on_walls, trust
+from fsmsm_jax.localisation.sharding import rank_on_mesh
+from fsmsm_jax.localisation.tiles import mesh_of
+from fsmsm_jax.sensing.buckets import filled, padded
 from fsmsm_jax.sensing.lidar import Scan
-from fsmsm_jax.sensing.panorama import panorama
 
-__all__ = ["Candidates", "Localisation", "SearchConfig", "localise", "localise_batch"]
+__all__ = [
+    "Candidates",
+    "Localisation",
+    "SearchConfig",
+    "check_echoes",
+    "localise",
+    "localise_batch",
+    "query",
+    "query_batch",
+]
 
 _TOGETHER = 4  # scans of a batch in step: the quickest of 1, 2, 4 and 8 on two cores
+_OFF_WALLS = 0.5  # [nats a ray]: quarter to twice of it do as well on all recordings
 _FEWEST_ECHOES = 20  # fewer end points fit somewhere in any building
 
 
 class SearchConfig(eqx.Module):
     """How many candidates survive each step, and how many rays judge them."""
 
-    headings: int = eqx.field(static=True, default=90)
-    """Headings of the exhaustive search, a multiple of 6."""
-    ranked: int = eqx.field(static=True, default=1024)
-    """Lattice poses that the panoramas turn and rank again."""
-    descended: int = eqx.field(static=True, default=144)
-    """Candidates that descend on their end points."""
-    polished: int = eqx.field(static=True, default=32)
+    headings: int = eqx.field(static=True, default=60)
+    """Headings of the exhaustive search, an even number."""
+    ranked: int = eqx.field(static=True, default=4096)
+    """Lattice poses that descend with few rays."""
+    descended: int = eqx.field(static=True, default=384)
+    """Candidates that descend with more."""
+    polished: int = eqx.field(static=True, default=96)
     """Distinct candidates polished by their ranges."""
-    reported: int = eqx.field(static=True, default=8)
+    reported: int = eqx.field(static=True, default=16)
     """Distinct candidates in the answer."""
     search_rays: int = eqx.field(static=True, default=180)
     """Rays of the exhaustive search and of the polish."""
     descent_rays: int = eqx.field(static=True, default=90)
-    """Rays of the descent."""
+    """Rays of the second descent, twice as many as of the first."""
 
     def __check_init__(self):
         """Refuse what the search cannot work with."""
-        if self.headings < 6 or self.headings % 6:
-            raise ValueError(f"headings must be a multiple of 6, got {self.headings}")
+        if self.headings < 6 or self.headings % 2:
+            raise ValueError(
+                f"headings must be an even number from 6 on, got {self.headings}"
+            )
         if not 2 <= self.reported <= self.polished <= self.descended <= self.ranked:
             raise ValueError(
                 "candidates dwindle: expected 2 ≤ reported ≤ polished ≤ descended "
@@ -122,7 +141,10 @@ def localise(
         >>> fj.localise(atlas, scan).pose  # doctest: +SKIP
     """
     _check(atlas, scan, batched=False)
-    return _localise(atlas, scan, config)
+    scan = padded(scan)
+    if mesh_of(atlas.tiles) is None:
+        return query(atlas, scan, config)
+    return _settle_jit(atlas.world, scan, _ranked_on_mesh(atlas, scan, config), config)
 
 
 def localise_batch(
@@ -143,7 +165,13 @@ def localise_batch(
         ValueError: as `localise`, for any of the scans.
     """
     _check(atlas, scans, batched=True)
-    return _localise_batch(atlas, scans, config)
+    # Few shapes: rays that say nothing, and the last scan again, fill the batch up.
+    count = len(scans.ranges)
+    scans = filled(padded(scans), room_for(count))
+    if mesh_of(atlas.tiles) is None:
+        return cut(query_batch(atlas, scans, config), count)
+    poses = _ranked_on_mesh(atlas, scans, config)
+    return cut(_settle_batch(atlas.world, scans, poses, config), count)
 
 
 def _check(atlas, scan, *, batched):
@@ -158,31 +186,73 @@ def _check(atlas, scan, *, batched):
             f"expected {'(scans, rays)' if batched else '(rays,)'} ranges, got shape "
             f"{np.shape(scan.ranges)}; localise takes one scan, localise_batch many"
         )
-    near = np.asarray(scan.echo) & (np.asarray(scan.ranges) < atlas.config.reach)
+    check_echoes(scan, atlas.config.reach)
+
+
+def check_echoes(scan: Scan, reach: float) -> None:
+    """Refuse a scan, or a batch with one, that would fit anywhere.
+
+    Raises:
+        ValueError: it has fewer than 20 echoes within the reach [m] of an atlas.
+    """
+    near = np.asarray(scan.echo) & (np.asarray(scan.ranges) < reach)
     echoes = near.sum(axis=-1)
     if np.min(echoes) < _FEWEST_ECHOES:
         raise ValueError(
             f"{np.min(echoes)} of {near.shape[-1]} rays met something within "
-            f"{atlas.config.reach} m; at least {_FEWEST_ECHOES} are needed to tell one "
+            f"{reach} m; at least {_FEWEST_ECHOES} are needed to tell one "
             "place from another. Check range_max and units, or move to where there are "
             "walls in sight"
         )
 
 
 @jax.jit
-def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisation:
-    world = atlas.world
+def query(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisation:
+    """`localise` without a look at what it is given, for an atlas on one device."""
+    return _settle(atlas.world, scan, _ranked(atlas, scan, config), config)
+
+
+@jax.jit
+def query_batch(atlas: ScanAtlas, scans: Scan, config: SearchConfig) -> Localisation:
+    """`localise_batch` without a look at what it is given."""
+    ranked = jax.lax.map(lambda scan: _ranked(atlas, scan, config), scans)
+    return _settle_each(atlas.world, scans, ranked, config)
+
+
+def _ranked(atlas, scan, config):
+    """Lattice poses worth a descent."""
+    thin = scan.thin(config.search_rays)
+    return rank_poses(atlas, thin, config.headings, config.ranked).poses
+
+
+def _ranked_on_mesh(atlas, scan, config):
+    """The same, of one scan or a batch, by all devices of the atlas."""
+    sizes = config.search_rays, config.headings, config.ranked
+    return rank_on_mesh(atlas, scan, *sizes)
+
+
+def _settle_each(world, scans, poses, config):
+    settle = lambda one: _settle(world, one[0], one[1], config)
+    return jax.lax.map(settle, (scans, poses), batch_size=_TOGETHER)
+
+
+def _settle(world, scan, poses, config) -> Localisation:
+    """From lattice poses to an answer."""
+    few = scan.thin(config.descent_rays // 2)
     ranking_scan = scan.thin(config.search_rays)
     descent_scan = scan.thin(config.descent_rays)
 
-    poses, row, score = rank_poses(atlas, ranking_scan, config.headings, config.ranked)
-    poses, similarity = _turn(atlas, scan, poses, row)
-    count = min(config.descended, len(poses))
-    best = jax.lax.top_k(score + 0.5 * similarity, count)[1]
+    scales = jnp.array([0.8, 0.5, 0.3])
+    descend = lambda pose: descend_end_points(world, few, pose, scales)
+    # Barriers keep XLA from computing poses and scores again for each of their readers.
+    poses = jax.lax.optimization_barrier(jax.vmap(descend)(poses))
+    score = jax.vmap(lambda pose: on_walls(world, few, pose))(poses)
+    score = jax.lax.optimization_barrier(score)
+    poses = poses[jax.lax.top_k(score, min(config.descended, len(poses)))[1]]
 
-    scales = jnp.array([0.5, 0.4, 0.3, 0.25, 0.2, 0.2])
+    scales = jnp.array([0.3, 0.25, 0.2, 0.2])
     descend = lambda pose: descend_end_points(world, descent_scan, pose, scales)
-    poses = jax.vmap(descend)(poses[best])
+    poses = jax.vmap(descend)(poses)
     score = _judge(world, descent_scan, poses).score
     poses = poses[_distinct(poses, score, config.polished, 0.25, 0.15)[0]]
 
@@ -212,36 +282,22 @@ def _localise(atlas: ScanAtlas, scan: Scan, config: SearchConfig) -> Localisatio
     )
 
 
-@jax.jit
-def _localise_batch(atlas, scans, config):
-    one = lambda scan: _localise(atlas, scan, config)
-    return jax.lax.map(one, scans, batch_size=_TOGETHER)
-
-
-def _turn(atlas, scan, poses, row):
-    """Headings by the DFT: where the real panorama correlates best, near each pose.
-
-    q[k] = Re Σ_n m_n conj(z_n) v_{n+k}, z and v the range phases of the real and the
-    map's panorama, m the mask: at heading θ = 2πk/N the two scans are alike.
-    """
-    rays = atlas.config.rays
-    real = panorama(scan, rays)
-    phases = jnp.where(real.valid, range_phases(real.ranges), 0.0)
-    spectrum = jnp.conj(jnp.fft.fft(phases))[None] * atlas.panoramas[row]
-    q = jnp.fft.ifft(spectrum).real / jnp.maximum(jnp.sum(real.valid), 1)
-    step = 2 * jnp.pi / rays
-    window = jnp.round(poses[:, 2] / step).astype(int)[:, None]
-    window = window + jnp.arange(-2, 3)[None]
-    near = jnp.take_along_axis(q, window % rays, axis=1)
-    best = jnp.argmax(near, axis=1, keepdims=True)
-    theta = jnp.take_along_axis(window, best, axis=1)[:, 0] * step
-    turned = poses.at[:, 2].set(geometry.wrap(theta))
-    return turned, jnp.take_along_axis(near, best, axis=1)[:, 0]
+_settle_jit, _settle_batch = jax.jit(_settle), jax.jit(_settle_each)
 
 
 def _judge(world, scan, poses, thickness=None) -> Evidence:
+    """`explain`, whose score loses where rays end off walls or lead through some.
+
+    In equal corridors a grazing ray's range says little and its end point still much.
+    """
+
+    def one(pose, thickness):
+        evidence = explain(world, scan, pose, thickness)
+        off = 1 - on_walls(world, scan, pose)
+        return evidence._replace(score=evidence.score - _OFF_WALLS * off)
+
     thickness = jnp.zeros(len(poses)) if thickness is None else thickness
-    return jax.vmap(lambda *place: explain(world, scan, *place))(poses, thickness)
+    return jax.vmap(one)(poses, thickness)
 
 
 def _distinct(poses, score, count, distance, angle):

@@ -47,3 +47,4 @@ from fsmsm_jax.plotting.slam import (
     plot_run_times as plot_run_times,
     plot_slam as plot_slam,
 )
+from fsmsm_jax.plotting.benchmark import plot_scaling as plot_scaling

@@ -7,6 +7,7 @@ that answers "where am I?" on three scales: the building, the room, and the cent
 of the covariance ellipse.
 """
 
+import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from matplotlib.axes import Axes
@@ -45,7 +46,7 @@ _HALO = [withStroke(linewidth=2.5, foreground="white")]
 _MARGIN = 0.5  # [m] around the free space of a map
 _RIVALS = 4  # runner-ups worth a number on the map
 
-Pose = Float[Array, "3"]
+Pose = Float[Array, "3"] | Float[np.ndarray, "3"]
 
 
 def plot_world(
@@ -87,8 +88,7 @@ def plot_scan(
     Returns:
         The rays and the end points; rays that met nothing are left out.
     """
-    echo = np.asarray(scan.echo)
-    points = np.asarray(transform_points(pose, scan.points))[echo]
+    points = np.asarray(_points_on_map(pose, scan))[np.asarray(scan.echo)]
     start = np.broadcast_to(np.asarray(pose[:2]), points.shape)
     rays = _segments(ax, start, points, colors=SCAN, linewidths=0.4, alpha=0.2)
     ends = ax.scatter(*points.T, s=2.5, color=SCAN, linewidths=0, zorder=3)
@@ -121,7 +121,10 @@ def plot_pose(
 
 
 def plot_covariance(
-    ax: Axes, pose: Pose, covariance: Float[Array, "3 3"], sigmas: float = 3.0
+    ax: Axes,
+    pose: Pose,
+    covariance: Float[Array, "3 3"] | Float[np.ndarray, "3 3"],
+    sigmas: float = 3.0,
 ) -> Ellipse:
     """The ellipse of a position's uncertainty, `sigmas` standard deviations around it.
 
@@ -200,6 +203,11 @@ def plot_localisation(
     return [ax, room, close]
 
 
+@jax.jit
+def _points_on_map(pose, scan):
+    return transform_points(pose, scan.points)
+
+
 def _segments(ax: Axes, start: ArrayLike, end: ArrayLike, **style) -> LineCollection:
     """Straight lines from each start to its end."""
     lines = LineCollection(list(np.stack([start, end], axis=1)), **style)
@@ -211,7 +219,8 @@ def _colours(cells: np.ndarray) -> np.ndarray:
     """Red, green, blue of each cell: white to wall colour by occupancy, or unknown."""
     share = np.clip(cells, 0, 100)[..., None] / 100
     known = 1 + share * (np.array(to_rgb(WALL)) - 1)
-    return np.where(cells[..., None] < 0, to_rgb(UNKNOWN), known)
+    colours = np.where(cells[..., None] < 0, to_rgb(UNKNOWN), known)
+    return np.rint(255 * colours).astype(np.uint8)
 
 
 def _frame(ax: Axes, points: np.ndarray) -> None:

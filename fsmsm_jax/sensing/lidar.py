@@ -124,12 +124,15 @@ class Scan(eqx.Module):
                 f"or under range_min = {range_min}); check the units (metres) and the "
                 "driver"
             )
+        # Not by asarray: that is a program, and each number of rays another one.
+        real = jax.dtypes.canonicalize_dtype(float)
+        put = lambda values, dtype: jax.device_put(np.array(values, dtype))
         return cls(
-            ranges=jnp.asarray(np.where(echo, ranges, range_max), float),
-            bearings=jnp.asarray(bearings, float),
-            valid=jnp.asarray(valid),
-            echo=jnp.asarray(echo),
-            range_max=jnp.asarray(range_max, float),
+            ranges=put(np.where(echo, ranges, range_max), real),
+            bearings=put(bearings, real),
+            valid=put(valid, bool),
+            echo=put(echo, bool),
+            range_max=put(range_max, real),
         )
 
     @property

@@ -25,6 +25,7 @@ __all__ = ["panorama"]
 _STEEPEST = 3.7  # tan 75°: flatter views of a wall are rare, jumps in depth are not
 _REACH = 0.75  # of a spacing: ½ covers even rays exactly, the rest forgives jitter
 _MAX_REACH = np.pi / 4  # one lone ray says little about the rest of the circle
+_SAME = 1e-5  # [rad]: directions that differ by less differ by rounding
 
 
 def panorama(scan: Scan, rays: int) -> Scan:
@@ -36,8 +37,9 @@ def panorama(scan: Scan, rays: int) -> Scan:
 
     Returns:
         A scan over the full circle. A ray is invalid when no valid ray of `scan`
-        lies within ¾ of the wider of two spacings, the median one of `scan` and
-        the one asked for (45° at most); invalid and echoless rays read `range_max`.
+        lies within ¾ of the wider of two spacings, the median one of `scan`'s
+        directions and the one asked for (45° at most); invalid and echoless rays read
+        `range_max`.
 
     Raises:
         ValueError: fewer than 3 rays are asked for.
@@ -67,9 +69,7 @@ def panorama(scan: Scan, rays: int) -> Scan:
     ahead = jnp.mod(bearings[after] - wanted, 2 * jnp.pi)
     nearer = jnp.where(back <= ahead, before, after)
 
-    around = jnp.sort(bearings)
-    spacing = jnp.median(jnp.diff(around, append=around[:1] + 2 * jnp.pi))
-    reach = jnp.maximum(spacing, 2 * jnp.pi / rays) * _REACH
+    reach = jnp.maximum(_spacing(bearings), 2 * jnp.pi / rays) * _REACH
     reach = jnp.minimum(reach, _MAX_REACH)
     valid = scan.valid[nearer] & (jnp.minimum(back, ahead) <= reach)
     echo = valid & scan.echo[nearer]
@@ -96,3 +96,15 @@ def panorama(scan: Scan, rays: int) -> Scan:
         echo=echo,
         range_max=scan.range_max,
     )
+
+
+def _spacing(bearings):
+    """Median angle from one direction to the next [rad].
+
+    Directions, not rays: those that only fill an array up (`buckets`) repeat one.
+    """
+    around = jnp.sort(bearings)
+    gaps = jnp.diff(around, append=around[:1] + 2 * jnp.pi)
+    directions = jnp.sum(gaps > _SAME)
+    sizes = jnp.sort(jnp.where(gaps > _SAME, gaps, jnp.inf))
+    return 0.5 * (sizes[(directions - 1) // 2] + sizes[directions // 2])

@@ -161,7 +161,7 @@ def _hit_cells(world, position, headings, range_max):
     local = headings - world.origin[2]
     far = jnp.broadcast_to(range_max / world.resolution, headings.shape)
     t, column, row = march(world.clearance, o[:, 0], o[:, 1], local, far)
-    height, width = world.cells.shape
+    height, width = world.extent
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     hit = inside & (t < far)
     ranges = jnp.where(hit, t * world.resolution, range_max)
@@ -169,7 +169,7 @@ def _hit_cells(world, position, headings, range_max):
     # Slope half a cell before the wall, where both faces of a thin wall do not cancel.
     x = o[:, 0] + (t - 0.5) * jnp.cos(local) - 0.5
     y = o[:, 1] + (t - 0.5) * jnp.sin(local) - 0.5
-    gx, gy = _interpolated(world.slope, x, y)
+    gx, gy = _interpolated(world.slope, x, y, world.extent)
     c, s = jnp.cos(world.origin[2]), jnp.sin(world.origin[2])
     normal = s * gy - c * gx, -s * gx - c * gy
     return ranges, *_towards_sensor(*normal, jnp.cos(headings), jnp.sin(headings), hit)
@@ -184,9 +184,9 @@ def _towards_sensor(nx, ny, dx, dy, hit: Bool[Array, "rays"]):
     return nx * scale, ny * scale
 
 
-def _interpolated(field, x, y):
+def _interpolated(field, x, y, extent):
     """The two components of a field, bilinear, at (column, row) points."""
-    height, width, _ = field.shape
+    height, width = extent
     x, y = jnp.clip(x, 0, width - 1.001), jnp.clip(y, 0, height - 1.001)
     i, j = x.astype(int), y.astype(int)
     u, v = x - i, y - j

@@ -130,7 +130,8 @@ def save_map(grid: OccupancyGrid, path: str | os.PathLike) -> None:
         raise ValueError(
             f"the path must end in .yaml or .yml, got {path}; the image goes beside"
         )
-    cells = np.flipud(np.asarray(grid.cells))
+    height, width = grid.extent
+    cells = np.flipud(np.asarray(grid.cells)[:height, :width])
     if np.isin(cells, (-1, 0, 100)).all():
         mode, pixels = "trinary", np.where(cells < 0, 205, np.where(cells == 0, 254, 0))
     else:

@@ -1,21 +1,29 @@
 """Building, keeping and refusing atlases."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
-from fsmsm_jax.localisation import AtlasConfig, ScanAtlas, build_atlas
-from fsmsm_jax.localisation.atlas import memory_estimate, range_phases
-from fsmsm_jax.sensing import raycast
-from fsmsm_jax.world import OccupancyGrid, PolygonMap
+from fsmsm_jax.localisation import (
+    AtlasConfig,
+    ScanAtlas,
+    atlas as building,
+    build_atlas,
+)
+from fsmsm_jax.localisation.atlas import memory_estimate
+from fsmsm_jax.world import OccupancyGrid
+from tests.oracles.localisation import shell_counts
 from tests.oracles.raycast import cast_grid, cast_walls
 from tests.worlds import l_room, random_grid
 
-CONFIG = AtlasConfig(spacing=0.5, rays=36, range_max=10.0, reach=6.0, margin=0.3)
-
-cast = jax.jit(raycast)
+CONFIG = AtlasConfig(spacing=0.5, rays=36, reach=2.8, margin=0.3)
+FINE = AtlasConfig(spacing=0.05, rays=36, reach=1.5)
+BEARINGS = -np.pi + 2 * np.pi * np.arange(36) / 36
+SHELL = 0.5
+"""Width of a shell [m]; a place counts its own and both beside it."""
 
 
 @pytest.fixture(scope="module")
@@ -36,117 +44,134 @@ def polygon_atlas():
     return build_atlas(l_room(), CONFIG)
 
 
-def positions(atlas):
-    row, column = np.nonzero(np.asarray(atlas.lattice.allowed))
-    return atlas.lattice.to_map(jnp.asarray(row), jnp.asarray(column))
+@pytest.fixture(scope="module")
+def cap():
+    """Half the bytes that `FINE` needs."""
+    return 0.5 * memory_estimate(l_room(), FINE)
 
 
-def cells_of(grid, points):
-    """(column, row) of map-frame points, by hand and in float64."""
-    x, y, yaw = np.asarray(grid.origin, float)
-    off = np.asarray(points, float) - [x, y]
-    c, s = np.cos(yaw), np.sin(yaw)
-    local = np.stack([c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0]])
-    return np.floor(local.T / float(grid.resolution)).astype(int)
+@pytest.fixture(scope="module")
+def refusal(cap):
+    """What is said, before anything is cast."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "_shells_from", None)
+        patch.setattr(building, "likelihood_spectra", None)
+        with pytest.raises(ValueError, match="a spacing of .* would fit") as refused:
+            build_atlas(l_room(), FINE, max_memory=cap)
+    return str(refused.value)
 
 
-def test_positions_stand_in_or_near_free_space(grid, atlas):
-    """On a turned grid: near is half a spacing, or the margin where nothing is known."""
-    column, row = cells_of(grid, positions(atlas)).T
-    free, unknown = np.asarray(grid.free), np.asarray(grid.unknown)
-    height, width = free.shape
-    assert ((column >= 0) & (column < width) & (row >= 0) & (row < height)).all()
-    gap = cKDTree(np.argwhere(free)).query(np.stack([row, column], axis=1))[0] * 0.05
-    reach = np.where(unknown[row, column], max(CONFIG.margin, 0.25), 0.25)
-    assert (gap <= reach + 1e-6).all()
-    assert (gap == 0).mean() > 0.5  # most stand on a free cell itself
+@pytest.fixture(scope="module")
+def fitting(refusal, cap):
+    """Of the spacing that was named."""
+    config = dataclasses.replace(FINE, spacing=named(refusal))
+    return build_atlas(l_room(), config, max_memory=cap)
 
 
-def test_no_node_on_a_free_cell_is_left_out(grid, atlas):
-    allowed = np.asarray(atlas.lattice.allowed)
-    row, column = (jnp.asarray(i) for i in np.indices(allowed.shape))
-    nodes = atlas.lattice.to_map(row, column).reshape(-1, 2)
-    j, i = cells_of(grid, nodes).T
-    height, width = grid.cells.shape
-    on_map = (j >= 0) & (j < width) & (i >= 0) & (i < height)
-    i, j = np.clip(i, 0, height - 1), np.clip(j, 0, width - 1)
-    on_free = (on_map & np.asarray(grid.free)[i, j]).reshape(allowed.shape)
-    assert on_free.any()
-    assert allowed[on_free].all()
-    # And the lattice leaves no known cell farther away than half its diagonal.
-    known = np.argwhere(np.asarray(grid.free | grid.occupied)) + 0.5
-    x, y = np.asarray(grid.to_map(jnp.asarray(known[:, ::-1], float))).T
-    gap = cKDTree(np.asarray(nodes)).query(np.stack([x, y], axis=1))[0]
-    assert gap.max() < CONFIG.spacing / np.sqrt(2) + 0.05
+def places(atlas):
+    """Map-frame positions (n, 2) of all nodes, and their shells (n, bins)."""
+    tiles = jax.tree.map(np.asarray, atlas.tiles)
+    tile, row, column = np.nonzero(tiles.allowed)
+    row, column = tiles.corner[tile].T + [row, column]
+    at = atlas.lattice.to_map(jnp.asarray(row), jnp.asarray(column))
+    return np.asarray(at, float), tiles.shells[tiles.allowed].astype(int)
 
 
-def test_nodes_are_one_spacing_apart_and_turned_with_the_map(grid, atlas):
-    at = lambda r, c: np.asarray(atlas.lattice.to_map(jnp.asarray(r), jnp.asarray(c)))
-    yaw = float(grid.origin[2])
-    along = CONFIG.spacing * np.array([np.cos(yaw), np.sin(yaw)])
-    up = CONFIG.spacing * np.array([-np.sin(yaw), np.cos(yaw)])
-    np.testing.assert_allclose(at(3, 5) - at(3, 4), along, atol=1e-5)
-    np.testing.assert_allclose(at(4, 4) - at(3, 4), up, atol=1e-5)
+def counts(ranges, bins):
+    """Rays in each shell and both beside it."""
+    one = shell_counts(ranges, np.ones(len(ranges), bool), SHELL, bins + 1)
+    return np.array([one[max(b - 1, 0) : b + 2].sum() for b in range(bins)])
 
 
-def test_polygon_positions_lie_inside(polygon_atlas):
-    """The L-room is 22 m² large: 88 nodes of a half-metre lattice fall inside."""
-    world = l_room()
-    inside = np.asarray(positions(polygon_atlas), float)
-    start, end = np.asarray(world.start, float), np.asarray(world.end, float)
-    angles = 2 * np.pi * np.arange(3) / 3 + 0.1
-    for place in inside:  # whoever is inside meets walls all around, and near
-        assert cast_walls(start, end, place, angles, 50.0).max() < 10
-    assert len(inside) == len(polygon_atlas.panoramas)
-    area = 6 * 2.5 + 3 * 3.5
-    assert abs(len(inside) - area / CONFIG.spacing**2) <= 12  # half a node an edge
+def named(refusal):
+    """The spacing that would fit [m]."""
+    return float(refusal.split("a spacing of ")[1].split(" m")[0])
 
 
-def test_panoramas_are_scans_in_the_map_frame(grid, atlas):
-    """Ray n looks along −π + 2πn/rays of the map, whatever the grid's yaw."""
-    bearings = -np.pi + 2 * np.pi * np.arange(CONFIG.rays) / CONFIG.rays
-    places = np.asarray(positions(atlas), float)
+def same(one, other):
+    """Whether two atlases are the same, map and all."""
+    assert jax.tree.structure(one) == jax.tree.structure(other)  # config, spacing
+    for ours, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        if ours.dtype != theirs.dtype or not np.array_equal(ours, theirs):
+            return False
+    return True
+
+
+def test_shells_are_those_of_scans_from_each_place(grid, atlas):
+    """By the oracle's casts, on a turned grid, to beyond the reach."""
+    at, told = places(atlas)
+    assert told.shape == (len(at), 6)
+    stops, origin = np.asarray(grid.occupied), np.asarray(grid.origin, float)
     wrong = 0
-    for place, spectrum in zip(places, np.asarray(atlas.panoramas), strict=True):
+    for place, found in zip(at, told, strict=True):
         poses = np.tile([*place, 0.0], (CONFIG.rays, 1))
-        stops, origin = np.asarray(grid.occupied), np.asarray(grid.origin, float)
-        exact = cast_grid(stops, 0.05, origin, poses, bearings, CONFIG.range_max)
-        wanted = np.asarray(range_phases(jnp.asarray(exact, float)))
-        wrong += np.sum(np.abs(np.fft.ifft(spectrum) - wanted) > 0.01)
-    # Rays along the edges of cells may fall to either side.
-    assert wrong < 0.02 * places.shape[0] * CONFIG.rays
+        exact = cast_grid(stops, 0.05, origin, poses, BEARINGS, 50.0)
+        wrong += np.abs(found - counts(exact, 6)).sum()
+    # A ray along the edges of cells may fall to either side, out of three shells and
+    # into three others.
+    assert wrong < 0.01 * 6 * len(at) * CONFIG.rays
 
 
-def test_row_of_counts_the_positions(atlas):
-    allowed = np.asarray(atlas.lattice.allowed)
-    rows = np.asarray(atlas.row_of)
-    np.testing.assert_array_equal(rows[allowed], np.arange(len(atlas.panoramas)))
+def test_where_none_may_stand_nothing_is_seen(atlas, polygon_atlas):
+    for built in (atlas, polygon_atlas):
+        allowed = np.asarray(built.tiles.allowed)
+        assert not np.asarray(built.tiles.shells)[~allowed].any()
+        assert np.asarray(built.tiles.shells)[allowed].any(axis=-1).mean() > 0.9
 
 
-def test_more_positions_than_a_chunk_are_all_scanned():
-    """1 452 positions: the second chunk is padded and cut."""
-    room = PolygonMap.from_outlines([[5, -4], [16, -4], [16, -1], [5, -1]])
-    config = AtlasConfig(spacing=0.15, rays=8, range_max=20.0)
-    atlas = build_atlas(room, config)
-    assert len(atlas.panoramas) > 1024
-    place = positions(atlas)
-    assert len(place) == len(atlas.panoramas)
-    bearings = -np.pi + 2 * np.pi * np.arange(8) / 8
-    for i in (0, 1023, 1024, len(place) - 1):
-        ranges = cast(room, jnp.append(place[i], 0.0), jnp.asarray(bearings, float))
-        kept = np.fft.ifft(atlas.panoramas[i])
-        np.testing.assert_allclose(
-            kept, range_phases(jnp.minimum(ranges, 20.0)), atol=1e-3
-        )
+def test_more_places_than_a_chunk_are_all_scanned(fitting):
+    """The first tile's second chunk is followed by one that is padded and cut."""
+    first = int(fitting.tiles.allowed[0].sum())
+    chunk = building._CHUNK
+    assert first > chunk
+    assert first % chunk
+    at, told = places(fitting)
+    start, end = np.asarray(l_room().start, float), np.asarray(l_room().end, float)
+    last = len(at) - 1
+    for i in {*range(0, last, 97), chunk - 1, chunk, first - 1, min(first, last), last}:
+        exact = cast_walls(start, end, at[i], BEARINGS, 50.0)
+        near = np.abs(exact / SHELL - np.rint(exact / SHELL)) < 1e-4
+        off = np.abs(told[i] - counts(exact, 3)).sum()
+        assert off <= 2 * near.sum()  # at a limit, either side will do
 
 
 def test_memory_is_told_before(grid, atlas, polygon_atlas):
     for world, built in ((grid, atlas), (l_room(), polygon_atlas)):
-        spectra = built.panoramas.nbytes + built.end_points.nbytes
-        assert memory_estimate(world, CONFIG) == spectra
-        without_map = jax.tree.leaves(built)[len(jax.tree.leaves(world)) :]
-        rest = sum(a.nbytes for a in without_map) - spectra
-        assert 0 <= rest < 0.1 * spectra  # the lattice's own book-keeping
+        assert memory_estimate(world, CONFIG) == built.nbytes
+        without_map = jax.tree.leaves(built)[len(jax.tree.leaves(built.world)) :]
+        rest = sum(a.nbytes for a in without_map) - built.nbytes
+        assert 0 <= rest < 100  # the lattice's frame
+
+
+def test_too_large_an_atlas_is_refused_with_one_that_fits(refusal, cap, fitting):
+    """What is named fits and is not wastefully coarse."""
+    assert "spacing 0.05 m needs" in refusal
+    assert fitting.nbytes <= cap
+    assert f"with {fitting.nbytes / 1e6:.1f} MB" in refusal
+    # Bytes go with 1 / spacing², but tiles come in rounded numbers.
+    assert 0.05 * np.sqrt(2) <= fitting.config.spacing < 1.5 * 0.05 * np.sqrt(2)
+
+
+def test_a_fine_spacing_that_is_a_little_too_fine():
+    """Named in hundredths of a metre, it must not be rounded to what it was."""
+    cap = 0.99 * memory_estimate(l_room(), FINE)
+    with pytest.raises(ValueError, match="would fit, with") as refused:
+        build_atlas(l_room(), FINE, max_memory=cap)
+    assert 0.05 < named(str(refused.value)) < 0.08
+
+
+def test_what_just_fits_is_built(monkeypatch, polygon_atlas):
+    monkeypatch.setattr(building, "_TRIES", 1)  # to say what else would fit
+    again = build_atlas(l_room(), CONFIG, max_memory=polygon_atlas.nbytes)
+    assert same(again, polygon_atlas)
+    with pytest.raises(ValueError, match="spacing"):
+        build_atlas(l_room(), CONFIG, max_memory=polygon_atlas.nbytes - 1)
+
+
+@pytest.mark.parametrize("cap", [0, 1000])
+def test_where_nothing_fits_it_is_said(cap):
+    with pytest.raises(ValueError, match="no spacing would fit"):
+        build_atlas(l_room(), CONFIG, max_memory=cap)
 
 
 @pytest.mark.parametrize("kind", ["grid", "polygon"])
@@ -155,14 +180,48 @@ def test_a_saved_atlas_comes_back_as_it_was(tmp_path, kind, grid, atlas, polygon
     path = tmp_path / "folder.with.dots" / "a place"
     path.parent.mkdir()
     built.save(path)
-    loaded = ScanAtlas.load(path, world)
-    assert jax.tree.structure(loaded) == jax.tree.structure(built)  # config, spacing
-    for ours, theirs in zip(
-        jax.tree.leaves(loaded), jax.tree.leaves(built), strict=True
-    ):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
-    assert path.stat().st_size < 1.1 * memory_estimate(world, CONFIG) + 5000
+    assert same(ScanAtlas.load(path, world), built)
+    assert path.stat().st_size < built.nbytes + 5000
+    assert [*path.parent.iterdir()] == [path]
+
+
+@pytest.mark.parametrize("kind", ["grid", "polygon"])
+def test_an_atlas_made_on_disk_is_the_one_made_in_memory(
+    tmp_path, kind, grid, atlas, polygon_atlas
+):
+    built, world = (atlas, grid) if kind == "grid" else (polygon_atlas, l_room())
+    path = tmp_path / "made.npz"
+    path.write_text("what was there before")
+    assert same(build_atlas(world, CONFIG, file=str(path)), built)
+    built.save(tmp_path / "saved.npz")
+    assert same(
+        ScanAtlas.load(path, world), ScanAtlas.load(tmp_path / "saved.npz", world)
+    )
+    assert {p.name for p in tmp_path.iterdir()} == {"made.npz", "saved.npz"}
+
+
+@pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
+def test_what_breaks_off_leaves_no_file(tmp_path, monkeypatch, error, polygon_atlas):
+    """In the second tile; and what was there before stays."""
+    path = tmp_path / "atlas.npz"
+    cast, seen = building._shells_of, []
+
+    def broken(*of_tile):
+        seen.append(of_tile)
+        if len(seen) == 2:
+            raise error
+        return cast(*of_tile)
+
+    monkeypatch.setattr(building, "_shells_of", broken)
+    with pytest.raises(error):
+        build_atlas(l_room(), CONFIG, file=path)
+    assert not [*tmp_path.iterdir()]
+    polygon_atlas.save(path)
+    seen.clear()
+    with pytest.raises(error):
+        build_atlas(l_room(), CONFIG, file=path)
+    assert [*tmp_path.iterdir()] == [path]
+    assert same(ScanAtlas.load(path, l_room()), polygon_atlas)
 
 
 def changed(world, kind):
@@ -195,24 +254,44 @@ def test_an_atlas_of_another_map_is_refused(tmp_path, grid, atlas, kind):
 def test_the_same_map_built_again_is_accepted(tmp_path, grid, atlas):
     atlas.save(tmp_path / "atlas.npz")
     again = changed(grid, "nothing")
-    loaded = ScanAtlas.load(tmp_path / "atlas.npz", again)
-    assert loaded.world is again
+    assert same(ScanAtlas.load(tmp_path / "atlas.npz", again), atlas)
+
+
+def test_a_map_in_larger_arrays_is_the_same_map(tmp_path, grid, atlas):
+    """What `padded` adds is no part of it, for building and for loading."""
+    padded = grid.padded()
+    assert padded.cells.shape != grid.cells.shape
+    again = build_atlas(padded, CONFIG)
+    assert same(again, atlas)
+    for built, world in ((atlas, padded), (again, grid)):
+        built.save(tmp_path / "atlas.npz")
+        assert same(ScanAtlas.load(tmp_path / "atlas.npz", world), atlas)
+    # But a map that truly goes on there is another one.
+    more = np.asarray(padded.cells)
+    assert (more == -1).sum() > (np.asarray(grid.cells) == -1).sum()
+    larger = OccupancyGrid.from_cells(more, 0.05, np.asarray(grid.origin, float))
+    with pytest.raises(ValueError, match="another map"):
+        ScanAtlas.load(tmp_path / "atlas.npz", larger)
 
 
 def spoil(path, how):
     whole = path.read_bytes()
+    with np.load(path) as saved:
+        arrays = dict(saved)
+    rest = lambda *names: {k: a for k, a in arrays.items() if k not in names}
     if how == "missing":
         path.unlink()
-    elif how == "empty":
-        path.write_bytes(b"")
-    elif how == "half":
-        path.write_bytes(whole[: len(whole) // 2])
+    elif how == "a folder":
+        path.unlink()
+        path.mkdir()
+    elif how.startswith("cut at "):
+        path.write_bytes(whole[: int(len(whole) * float(how[7:]))])
     elif how == "last bytes gone":
         path.write_bytes(whole[:-30])
-    elif how == "a flipped byte":
-        middle = len(whole) // 2
-        flipped = bytes([whole[middle] ^ 255])
-        path.write_bytes(whole[:middle] + flipped + whole[middle + 1 :])
+    elif how.startswith("flipped at "):
+        place = int(len(whole) * float(how[11:]))
+        flipped = bytes([whole[place] ^ 1])
+        path.write_bytes(whole[:place] + flipped + whole[place + 1 :])
     elif how == "text":
         path.write_text("image: map.pgm\nresolution: 0.05\n")
     elif how == "other arrays":
@@ -220,39 +299,81 @@ def spoil(path, how):
     elif how == "one array":
         with path.open("wb") as file:
             np.save(file, np.ones(3))
-    elif how == "a folder":
-        path.unlink()
-        path.mkdir()
-    elif how in ("too few panoramas", "other ray count"):
-        with np.load(path) as saved:
-            arrays = dict(saved)
-        kept = arrays["panoramas"]
-        fewer = kept[:-1] if how == "too few panoramas" else kept[:, :-1]
-        np.savez(path, **{**arrays, "panoramas": fewer})
+    else:
+        small = arrays["spectra"][:, :-1], arrays["shells"][..., :-1]
+        write, kept = {
+            "compressed": (np.savez_compressed, arrays),
+            "no version": (np.savez, rest("version")),
+            "of tomorrow": (np.savez, {**arrays, "version": np.asarray(3)}),
+            "no spectra": (np.savez, rest("spectra")),
+            "no spacing": (np.savez, rest("config_spacing")),
+            "a negative spacing": (np.savez, {**arrays, "config_spacing": -1.0}),
+            "fewer tiles": (np.savez, {**arrays, "allowed": arrays["allowed"][:-1]}),
+            "fewer spectra": (np.savez, {**arrays, "spectra": arrays["spectra"][:-1]}),
+            "fewer shells": (np.savez, {**arrays, "shells": small[1]}),
+        }[how]
+        write(path, **kept)
 
 
 @pytest.mark.parametrize(
-    "how",
+    ("how", "why"),
     [
-        "missing",
-        "empty",
-        "half",
-        "last bytes gone",
-        "a flipped byte",
-        "text",
-        "other arrays",
-        "one array",
-        "a folder",
-        "too few panoramas",
-        "other ray count",
+        ("missing", "No such file"),
+        ("a folder", "directory"),
+        ("cut at 0", "zip"),
+        ("cut at 0.01", "zip"),
+        ("cut at 0.5", "zip"),
+        ("cut at 0.99", "zip"),
+        ("cut at 0.9999", "zip"),
+        ("last bytes gone", "zip"),
+        ("flipped at 0.1", "checksum"),
+        ("flipped at 0.5", "checksum"),
+        ("flipped at 0.9", "checksum"),
+        ("text", "zip"),
+        ("other arrays", "version 1, not 2"),
+        ("one array", "zip"),
+        ("compressed", "compressed"),
+        ("no version", "version 1, not 2"),
+        ("of tomorrow", "version 3, not 2"),
+        ("no spectra", "spectra"),
+        ("no spacing", "spacing"),
+        ("a negative spacing", "spacing"),
+        ("fewer tiles", "fit together"),
+        ("fewer spectra", "fit together"),
+        ("fewer shells", "fit together"),
     ],
 )
-def test_a_spoilt_file_is_refused(tmp_path, grid, atlas, how):
+def test_a_spoilt_file_is_refused(tmp_path, grid, atlas, how, why):
+    """By its name, with the reason, and with what to do."""
     path = tmp_path / "atlas.npz"
     atlas.save(path)
     spoil(path, how)
-    with pytest.raises(ValueError, match="atlas"):
+    with pytest.raises(
+        ValueError, match=f"cannot read a scan atlas from .*{why}"
+    ) as no:
         ScanAtlas.load(path, grid)
+    assert str(path) in str(no.value)
+    assert "build_atlas" in str(no.value)
+
+
+def test_a_changed_byte_of_the_directory_is_refused_or_means_nothing(
+    tmp_path, grid, atlas
+):
+    """The last part of the file is the zip's own, without a checksum."""
+    path = tmp_path / "atlas.npz"
+    atlas.save(path)
+    whole = path.read_bytes()
+    refused = 0
+    for place in range(len(whole) - 900, len(whole), 7):
+        for flip in (1, 255):
+            flipped = bytes([whole[place] ^ flip])
+            path.write_bytes(whole[:place] + flipped + whole[place + 1 :])
+            try:
+                assert same(ScanAtlas.load(path, grid), atlas)
+            except ValueError as no:
+                assert "cannot read a scan atlas" in str(no)  # noqa: PT017
+                refused += 1
+    assert refused > 50
 
 
 @pytest.mark.parametrize(
@@ -261,10 +382,11 @@ def test_a_spoilt_file_is_refused(tmp_path, grid, atlas, how):
         ({"spacing": 0.0}, "spacing"),
         ({"spacing": -1.0}, "spacing"),
         ({"spacing": float("nan")}, "spacing"),
-        ({"range_max": float("inf")}, "range_max"),
+        ({"reach": float("inf")}, "reach"),
         ({"reach": 0.0}, "reach"),
         ({"softness": -0.1}, "softness"),
         ({"rays": 4}, "rays"),
+        ({"rays": 256}, "rays"),
         ({"margin": -0.1}, "margin"),
         ({"margin": float("nan")}, "margin"),
     ],
@@ -274,6 +396,10 @@ def test_settings_that_make_no_atlas_are_refused(setting, match):
         AtlasConfig(**setting)
 
 
+def test_more_rays_than_a_byte_counts_are_the_limit():
+    assert AtlasConfig(rays=255).rays == 255
+
+
 @pytest.mark.parametrize("value", [100, -1])
 def test_a_map_without_free_space_is_refused(value):
     world = OccupancyGrid.from_cells(np.full((20, 30), value), 0.05, (3.0, 4.0, 0.5))
@@ -281,21 +407,14 @@ def test_a_map_without_free_space_is_refused(value):
         build_atlas(world, CONFIG)
     with pytest.raises(ValueError, match="free|known"):
         memory_estimate(world, CONFIG)
-
-
-@pytest.mark.parametrize("kind", ["grid", "polygon"])
-def test_too_coarse_a_lattice_is_refused(kind, grid):
-    """Its one node would stand 25 m beside the map, where nothing is known."""
-    world = grid if kind == "grid" else l_room()
-    with pytest.raises(ValueError, match="spacing"):
-        build_atlas(world, AtlasConfig(spacing=50.0, rays=36))
+    with pytest.raises(ValueError, match="spacing"):  # its node is beside the room
+        build_atlas(l_room(), AtlasConfig(spacing=50.0))
 
 
 def test_a_progress_bar_on_request(capsys):
-    config = AtlasConfig(spacing=0.5, rays=36, range_max=10.0, reach=6.0, margin=0.3)
-    build_atlas(l_room(), config)
+    build_atlas(l_room(), CONFIG)
     assert capsys.readouterr().err == ""
-    build_atlas(l_room(), config, progress=True)
+    build_atlas(l_room(), CONFIG, progress=True)
     told = capsys.readouterr()
     assert "positions" in told.err
     assert "MB" in told.err

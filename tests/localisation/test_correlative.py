@@ -1,36 +1,74 @@
-"""The transform's scores against direct sums on a tiny map."""
+"""The transform's scores against direct sums on small maps, in one tile and in many."""
 
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from fsmsm_jax import geometry
-from fsmsm_jax.localisation import AtlasConfig, build_atlas, correlative
-from fsmsm_jax.localisation.atlas import range_phases
+from fsmsm_jax.localisation import AtlasConfig, build_atlas, correlative, tiles
 from fsmsm_jax.localisation.correlative import rank_poses
+from fsmsm_jax.localisation.lattice import lattice_over
+from fsmsm_jax.localisation.shells import places_left, scan_shells
 from fsmsm_jax.sensing import Lidar, Scan, raycast
 from fsmsm_jax.world import OccupancyGrid
-from tests.oracles.localisation import best_of_blocks, distance_to_walls, score_map
+from tests.oracles.localisation import best_of_pairs, distance_to_walls, score_map
 from tests.worlds import CENTRE, free_poses, l_room, random_cells
 
 HEADINGS = 24
 CONFIG = AtlasConfig(spacing=0.5, rays=36, reach=6.0, softness=0.4)
+SHORT = AtlasConfig(spacing=0.25, rays=36, reach=1.6, softness=0.4)
 SENSOR = Lidar.create(90, noise=0.01, range_max=12.0)
 RULES = (correlative._THROUGH, correlative._THROUGH_WEIGHT, correlative._CLEAR_OF_WALL)
-# A score is told in ticks of 2⁻²⁰, and float32 transforms of a thousand numbers err
+# A score is told in ticks of 2⁻²⁰, and float32 transforms of some thousand numbers err
 # by a few roundings of scores up to 1.
 EXACT = 2.0**-20 + 8 * 2.0**-23
 
-rank = jax.jit(rank_poses, static_argnums=(2, 3))
+MOVE = jnp.array([10.0, 20.0, 2 * 2 * np.pi / HEADINGS])
+
 cast = jax.jit(raycast)
+echoes = jax.jit(scan_shells, static_argnums=(1, 2))
+rank = jax.jit(rank_poses, static_argnums=(2, 3))
+
+
+def rank_all(atlas, scan):
+    """As many poses as there are; the map itself is not looked at."""
+    atlas = eqx.tree_at(lambda atlas: atlas.world, atlas, l_room())
+    return rank(atlas, scan, HEADINGS, 10**6)
+
+
+def unruled(atlas):
+    """The same atlas with shells that explain everything."""
+    full = jnp.full_like(atlas.tiles.shells, 255)
+    return eqx.tree_at(lambda atlas: atlas.tiles.shells, atlas, full)
 
 
 @pytest.fixture(scope="module")
 def atlas():
     return build_atlas(l_room(), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def tiled():
+    """Of a short reach, in eight tiles that are mostly rim."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tiles, "_SIDES", (24,))
+        made = build_atlas(l_room(), SHORT)
+    assert (made.tiles.side, made.tiles.core) == (24, 8)
+    assert made.tiles.allowed.any(axis=(1, 2)).sum() == 8
+    return made
+
+
+@pytest.fixture(scope="module")
+def closed_grids():
+    """Walls, furniture and an unknown corner; as it lies, and moved and turned."""
+    cells = np.pad(random_cells(3, 70, 100), 1, constant_values=100)
+    flat = OccupancyGrid.from_cells(cells, 0.05, (3.0, -8.0, 0.0))
+    moved = OccupancyGrid.from_cells(cells, 0.05, geometry.compose(MOVE, flat.origin))
+    return [(world, build_atlas(world, CONFIG)) for world in (flat, moved)]
 
 
 def scan_from(world, pose, seed=0):
@@ -47,51 +85,140 @@ def dirty_scan(seed):
     return Scan.from_ranges(ranges, -2.0, 0.05, 0.1, 12.0)
 
 
-def all_scores(world, allowed, padded_shape, scan):
-    """(headings, rows, columns) by direct summation, for a polygon world."""
+def lonely_scan():
+    """Few echoes at hand, and else nothing: the way of all other rays must be free."""
+    ranges = np.full(90, np.inf)
+    ranges[::8] = 0.4
+    return Scan.from_ranges(ranges, -np.pi, 2 * np.pi / 90, 0.1, 12.0)
+
+
+SCANS = {
+    "true": lambda: scan_from(l_room(), jnp.asarray([*(CENTRE + [0.6, 0.3]), 1.1])),
+    "dirty": lambda: dirty_scan(0),
+    "lonely": lonely_scan,
+}
+
+
+def all_scores(config, scan):
+    """(headings, rows, columns) by direct summation in the L-shaped room, and more.
+
+    Also its lower left corner, the headings, and where one may stand.
+    """
+    world = l_room()
+    _, allowed = lattice_over(world, config.spacing, config.margin)
     start, end = np.asarray(world.start, float), np.asarray(world.end, float)
     corner = np.minimum(start.min(axis=0), end.min(axis=0))
     row, column = np.indices(allowed.shape)
-    nodes = corner + (np.stack([column, row], axis=-1) + 0.5) * CONFIG.spacing
+    nodes = corner + (np.stack([column, row], axis=-1) + 0.5) * config.spacing
     d = distance_to_walls(start, end, nodes.reshape(-1, 2)).reshape(allowed.shape)
-    field = np.exp(-0.5 * (d / CONFIG.softness) ** 2)
+    field = np.exp(-0.5 * (d / config.softness) ** 2)
     valid, echo = np.asarray(scan.valid), np.asarray(scan.echo)
     ranges = np.where(echo, np.asarray(scan.ranges, float), np.inf)[valid]
     bearings = np.asarray(scan.bearings, float)[valid]
     theta = -np.pi + 2 * np.pi * np.arange(HEADINGS) / HEADINGS
     scores = [
-        score_map(field, padded_shape, ranges, bearings, t, CONFIG.spacing,
-                  CONFIG.reach, RULES)
+        score_map(field, ranges, bearings, t, config.spacing, config.reach, RULES)
         for t in theta
-    ]  # fmt: skip
-    return corner, theta, np.array(scores)
+    ]
+    return np.array(scores), corner, theta, allowed
 
 
-@pytest.mark.parametrize("kind", ["true", "dirty"])
+def index_of(poses, spacing, corner, theta):
+    """Heading, row and column of lattice poses, which are to be exactly there."""
+    poses = np.asarray(poses, float)
+    place = (poses[:, :2] - corner) / spacing - 0.5
+    column, row = np.rint(place).astype(int).T
+    np.testing.assert_allclose(place, np.rint(place), atol=1e-5)
+    k = np.argmin(np.abs(theta[None] - poses[:, 2:]), axis=1)
+    np.testing.assert_allclose(poses[:, 2], theta[k], atol=1e-6)
+    return k, row, column
+
+
+def assert_same_as_sums(found, config, scan, left=None, exact=EXACT):
+    """The list is that of the sums at the nodes that are left, score by score.
+
+    Sums have no lower bound, since rays without echo have a say in the ways but not in
+    the ends. Under −1 only the order counts, and that they are not taken for nothing.
+    """
+    scores, corner, theta, allowed = all_scores(config, scan)
+    left = allowed if left is None else left
+    wanted = best_of_pairs(scores, left)
+    told = np.asarray(found.score, float)
+    real = told > -2
+    assert real.sum() == len(wanted)
+    assert real[: len(wanted)].all()  # the rest comes last
+    poses, told = np.asarray(found.poses)[real], told[real]
+    likely = wanted > -1
+    np.testing.assert_allclose(told[likely], wanted[likely], atol=exact)
+    assert (told[~likely] <= -1 + exact).all()
+    # Each score is that of the very pose beside it, and none is listed twice.
+    k, row, column = index_of(poses, config.spacing, corner, theta)
+    assert left[row, column].all()
+    its = scores[k, row, column]
+    np.testing.assert_allclose(told[likely], its[likely], atol=exact)
+    assert len({*zip(k // 2, row, column, strict=True)}) == len(wanted)
+    return wanted
+
+
+@pytest.mark.parametrize("kind", SCANS)
 def test_scores_are_the_sums_they_stand_for(atlas, kind):
-    world, allowed = l_room(), np.asarray(atlas.lattice.allowed)
-    pose = jnp.asarray([*(CENTRE + [0.6, 0.3]), 1.1], float)
-    scan = scan_from(world, pose) if kind == "true" else dirty_scan(0)
-    corner, theta, scores = all_scores(world, allowed, atlas.padded_shape, scan)
-    listed = best_of_blocks(scores, allowed)
-    count = int(np.isfinite(listed).sum())
-    poses, _, told = rank(atlas, scan, HEADINGS, count)
-    np.testing.assert_allclose(told, listed[:count], atol=EXACT)
-    # Each score is that of the very pose beside it.
-    column, row = np.rint((np.asarray(poses[:, :2]) - corner) / 0.5 - 0.5).astype(int).T
-    k = np.argmin(np.abs(theta[None] - np.asarray(poses[:, 2:])), axis=1)
-    np.testing.assert_allclose(np.asarray(poses[:, 2]), theta[k], atol=1e-6)
+    """Also where there are few echoes, and ways through all walls."""
+    scan = SCANS[kind]()
+    wanted = assert_same_as_sums(rank_all(unruled(atlas), scan), CONFIG, scan)
+    assert (wanted.min() < -2) == (kind == "lonely")
+
+
+@pytest.mark.parametrize("kind", SCANS)
+def test_tiles_say_the_same(tiled, kind):
+    """End points beyond a tile's core are seen in its rim, wherever its neighbour is."""
+    scan = SCANS[kind]()
+    assert_same_as_sums(rank_all(unruled(tiled), scan), SHORT, scan)
+
+
+def test_the_best_of_all_tiles_come_first(tiled):
+    """Where only some are listed, they are the beginning of all."""
+    scan = SCANS["true"]()
+    some, every = rank(tiled, scan, HEADINGS, 40), rank_all(tiled, scan)
+    assert len(some.poses) == 40
+    np.testing.assert_array_equal(every.score[:40], some.score)
+    np.testing.assert_allclose(every.poses[:40], some.poses, atol=1e-5)
+
+
+def left_by_shells(atlas, scan, shape):
+    """Nodes that the shells leave, laid out as the lattice is."""
+    core = atlas.tiles.core
+    left = np.zeros((shape[0] + core, shape[1] + core), bool)
+    seen = echoes(scan, atlas.config.rays, atlas.config.reach)
+    kept = np.asarray(places_left(seen, atlas.tiles.shells) & atlas.tiles.allowed)
+    for (row, column), tile in zip(np.asarray(atlas.tiles.corner), kept, strict=True):
+        left[row : row + core, column : column + core] |= tile
+    return left[: shape[0], : shape[1]]
+
+
+@pytest.mark.parametrize("kind", ["atlas", "tiled"])
+def test_what_the_shells_rule_out_is_not_listed(kind, request):
+    """Whole tiles, too, where nobody is left."""
+    made = request.getfixturevalue(kind)
+    scan = SCANS["true"]()
+    config = made.config
+    _, allowed = lattice_over(l_room(), config.spacing, config.margin)
+    left = left_by_shells(made, scan, allowed.shape)
+    assert 0 < left.sum() < allowed.sum()
+    assert_same_as_sums(rank_all(made, scan), config, scan, left)
+
+
+@pytest.mark.parametrize("kind", ["true", "lonely"])
+def test_nobody_stands_where_none_may(closed_grids, kind):
+    """In walls, furniture and the unknown, however many are asked for."""
+    world, made = closed_grids[1]
+    lattice, allowed = lattice_over(world, CONFIG.spacing, CONFIG.margin)
+    assert not allowed.all()
+    poses, scores = rank_all(unruled(made), SCANS[kind]())
+    real = np.asarray(scores) > -2
+    assert real.sum() == HEADINGS // 2 * allowed.sum()
+    back = geometry.transform_points(geometry.inverse(lattice.frame), poses[:, :2])
+    column, row = np.rint(np.asarray(back)[real] / CONFIG.spacing - 0.5).astype(int).T
     assert allowed[row, column].all()
-    np.testing.assert_allclose(told, scores[k, row, column], atol=EXACT)
-
-
-def test_far_end_points_come_round_but_do_not_reach_the_map(atlas):
-    """An echo off the map by less than the padding meets nothing, wherever it wraps."""
-    rows, columns = atlas.lattice.allowed.shape
-    height, width = atlas.padded_shape
-    reach = 0.5 * CONFIG.reach / CONFIG.spacing
-    assert height >= rows + reach
-    assert width >= columns + reach
 
 
 def test_the_right_place_is_among_the_first(atlas):
@@ -100,68 +227,63 @@ def test_the_right_place_is_among_the_first(atlas):
     for i in range(12):
         offset = [*rng.uniform([-1.2, -0.5], [3.0, 1.0]), rng.uniform(-np.pi, np.pi)]
         pose = jnp.asarray(np.array([*CENTRE, 0.0]) + offset, float)
-        poses, _, _ = rank(atlas, scan_from(world, pose, i), HEADINGS, 32)
+        poses, _ = rank_all(atlas, scan_from(world, pose, i))
         off = np.asarray(poses[:10], float) - np.asarray(pose)
         turned = np.abs((off[:, 2] + np.pi) % (2 * np.pi) - np.pi)
         near = np.hypot(off[:, 0], off[:, 1]) < 1.5 * CONFIG.spacing
         assert (near & (turned < 1.5 * 2 * np.pi / HEADINGS)).any()
 
 
-def test_of_a_block_only_the_best_is_listed(atlas):
+def test_of_two_headings_only_the_better_is_listed(atlas):
     scan = scan_from(l_room(), jnp.asarray([*CENTRE, 0.4], float))
-    poses, _, scores = rank(atlas, scan, HEADINGS, 60)
-    lattice = atlas.lattice
-    node = (np.asarray(poses[:, :2]) - np.asarray(lattice.frame[:2])) / 0.5 - 0.5
-    sector = np.rint((np.asarray(poses[:, 2]) + np.pi) * HEADINGS / (2 * np.pi))
-    blocks = np.column_stack([np.rint(node) // 2, sector // 6])
-    assert len(np.unique(blocks, axis=0)) == len(blocks)
+    poses, scores = (a[:60] for a in rank_all(atlas, scan))
+    node = (np.asarray(poses[:, :2]) - np.asarray(atlas.lattice.frame[:2])) / 0.5 - 0.5
+    heading = np.rint((np.asarray(poses[:, 2]) + np.pi) * HEADINGS / (2 * np.pi))
+    pairs = np.column_stack([np.rint(node), heading % HEADINGS // 2])
+    assert len(np.unique(pairs, axis=0)) == len(pairs) == 60
     assert (np.diff(scores) <= 0).all()
     assert scores[0] <= 1
 
 
-def test_more_poses_than_there_are_are_not_asked_for(atlas):
+def test_more_poses_than_there_are_come_last_and_score_as_none(atlas):
     scan = scan_from(l_room(), jnp.asarray([*CENTRE, 0.4], float))
-    rows, columns = atlas.lattice.allowed.shape
-    blocks = -(-rows // 2) * -(-columns // 2) * HEADINGS // 6
-    poses, index, _ = rank(atlas, scan, HEADINGS, 10**6)
-    assert len(poses) == len(index) == blocks
-    assert (np.asarray(index) < len(atlas.panoramas)).all()
+    poses, scores = rank_all(atlas, scan)
+    assert len(poses) == len(scores) == HEADINGS // 2 * atlas.tiles.allowed.size
+    none = np.asarray(scores) == -2
+    assert none[np.argmax(none) :].all()
+    assert (np.asarray(scores)[~none] > -1.5).all()
+    assert np.isfinite(poses).all()
 
 
-def test_the_index_leads_to_the_panorama_of_the_place(atlas):
-    world = l_room()
-    scan = scan_from(world, jnp.asarray([*CENTRE, 0.4], float))
-    poses, index, _ = rank(atlas, scan, HEADINGS, 32)
-    bearings = jnp.linspace(-jnp.pi, jnp.pi, CONFIG.rays, endpoint=False)
-    for pose, i in zip(poses, index, strict=True):
-        ranges = cast(world, pose.at[2].set(0.0), bearings, CONFIG.range_max)
-        kept = np.fft.ifft(atlas.panoramas[i])
-        # A ray at a corner of the room may fall to either side of it.
-        differs = np.abs(kept - np.asarray(range_phases(ranges))) > 1e-3
-        assert differs.sum() <= 1
-
-
-def test_a_turned_map_is_searched_as_it_lies():
+def test_a_turned_map_is_searched_as_it_lies(closed_grids):
     """Turned by two steps of heading and shifted, the list is turned and shifted."""
-    cells = np.pad(random_cells(3, 70, 100), 1, constant_values=100)
-    flat = OccupancyGrid.from_cells(cells, 0.05, (3.0, -8.0, 0.0))
-    move = jnp.array([10.0, 20.0, 2 * 2 * np.pi / HEADINGS])
-    turned = OccupancyGrid.from_cells(cells, 0.05, geometry.compose(move, flat.origin))
-    here, there = build_atlas(flat, CONFIG), build_atlas(turned, CONFIG)
-    np.testing.assert_array_equal(here.lattice.allowed, there.lattice.allowed)
+    (flat, here), (_, there) = closed_grids
+    np.testing.assert_array_equal(here.tiles.allowed, there.tiles.allowed)
     pose = jnp.asarray(free_poses(flat, 1, seed=4)[0], float)
     scan = scan_from(flat, pose)
-    poses, index, scores = rank(here, scan, HEADINGS, 10)
-    moved, moved_index, moved_scores = rank(there, scan, HEADINGS, 10)
+    poses, scores = (a[:10] for a in rank_all(here, scan))
+    moved, moved_scores = (a[:10] for a in rank_all(there, scan))
     np.testing.assert_allclose(moved_scores, scores, atol=1e-4)
-    best = geometry.compose(move, poses[0])
+    best = geometry.compose(MOVE, poses[0])
     off = np.asarray(moved, float) - np.asarray(best)
     off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    # Equal scores may change places, and sectors of headings begin elsewhere.
+    # Equal scores may change places.
     same = np.flatnonzero(np.abs(off).max(axis=1) < 1e-3)
     assert len(same) == 1
-    assert int(moved_index[same[0]]) == int(index[0])
     assert abs(float(moved_scores[same[0]] - scores[0])) < 1e-4
+
+
+def test_in_double_precision(tiled):
+    """What is rounded then is the score, in ticks."""
+    with jax.enable_x64(True):
+        scan = dirty_scan(2)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(tiles, "_SIDES", (24,))
+            made = build_atlas(l_room(), SHORT)
+        found = rank_all(unruled(made), scan)
+        assert found.score.dtype == np.float64
+        assert_same_as_sums(found, SHORT, scan, exact=0.51 * 2.0**-20)
+    np.testing.assert_array_equal(made.tiles.allowed, tiled.tiles.allowed)
 
 
 def test_signature_says_what_is_static():

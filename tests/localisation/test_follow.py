@@ -30,7 +30,7 @@ from tests.localisation.simulated import (
     part,
 )
 
-SEARCH = {"headings": 60, "ranked": 256, "descended": 32, "polished": 8}
+SEARCH = dict(headings=60, ranked=256, descended=32, polished=8, reported=8)
 CONFIG = FollowConfig(search=SearchConfig(search_rays=120, descent_rays=60, **SEARCH))
 
 

@@ -8,8 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fsmsm_jax.localisation.judge import Evidence, explain, trust
+from fsmsm_jax.localisation import judge as judge_module
+from fsmsm_jax.localisation.judge import Evidence, explain, on_walls, trust
 from fsmsm_jax.sensing import Lidar, Scan, raycast
+from fsmsm_jax.world import PolygonMap
+from tests.oracles.localisation import distance_to_walls, on_walls as true_on_walls
 from tests.oracles.raycast import cast_walls
 from tests.worlds import CENTRE, l_room, rasterised_room
 
@@ -178,3 +181,112 @@ def test_jit_and_vmap_change_nothing(exact):
     eager = explain(world, scan, POSE)
     jitted = judge(world, scan, POSE)
     np.testing.assert_allclose(jnp.stack(eager), jnp.stack(jitted), atol=1e-5)
+
+
+WALL_RULES = (judge_module._ON_THE_WAY, judge_module._NEAR, judge_module._CLEAR_OF_WALL)
+
+walls_met = jax.jit(on_walls)
+
+
+def distances_in(world):
+    start, end = np.asarray(world.start, float), np.asarray(world.end, float)
+    return lambda points: distance_to_walls(start, end, points)
+
+
+def test_ends_on_walls_are_summed_ray_by_ray(exact):
+    """At true and wrong poses, with echoes missing and rays that say nothing.
+
+    Sums of 720 float32 terms, distances at 14 m from the origin: some 10⁻⁵.
+    """
+    rng = np.random.default_rng(5)
+    missing = jnp.where(jnp.arange(180) % 9 == 0, SENSOR.range_max, exact)
+    scan = scan_of(missing, jnp.arange(180) % 7 > 0)
+    for off in [np.zeros(3), *rng.uniform(-0.8, 0.8, (6, 3))]:
+        pose = np.asarray(POSE, float) + off
+        wanted = true_on_walls(distances_in(l_room()), scan, pose, WALL_RULES)
+        found = walls_met(l_room(), scan, jnp.asarray(pose, float))
+        np.testing.assert_allclose(found, wanted, atol=5e-5)
+
+
+def test_rays_on_walls_make_one_at_most(exact):
+    """At the truth nearly: grazing rays lead along walls before they end on them."""
+    world, rng = l_room(), np.random.default_rng(6)
+    assert 0.9 < float(walls_met(world, scan_of(exact), POSE)) <= 1
+    for _ in range(20):
+        scan = scan_of(jnp.asarray(rng.uniform(0.1, 9.0, 180), float))
+        pose = POSE + jnp.asarray(rng.uniform(-3, 3, 3), float)
+        assert float(walls_met(world, scan, pose)) <= 1
+    close = scan_of(jnp.full(180, 0.5))  # no way is long enough to be probed
+    ring = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    ring = 0.5 * np.stack([np.cos(ring), np.sin(ring)], axis=1) + np.asarray(POSE)[:2]
+    found = walls_met(PolygonMap.from_outlines(ring), close, POSE)
+    np.testing.assert_allclose(found, 1.0, atol=1e-4)
+
+
+def test_ends_are_on_walls_best_at_the_truth(exact):
+    world, scan, rng = l_room(), scan_of(exact), np.random.default_rng(7)
+    last = best = float(walls_met(world, scan, POSE))
+    for metres in (0.05, 0.1, 0.2, 0.4):
+        scores = []
+        for way in rng.uniform(-np.pi, np.pi, 8):
+            step = metres * np.array([np.cos(way), np.sin(way), 0.0])
+            scores.append(float(walls_met(world, scan, POSE + jnp.asarray(step))))
+        assert max(scores) < best
+        assert np.mean(scores) < last
+        last = np.mean(scores)
+    turned = [float(walls_met(world, scan, POSE.at[2].add(a))) for a in (-0.1, 0.1)]
+    assert max(turned) < best
+
+
+@pytest.mark.parametrize("way", [(0.0, -1.0), (-1.0, 0.0), (1.0, 0.6), (0.3, 1.0)])
+def test_a_pose_moved_through_a_wall_is_worse(exact, way):
+    """Half a metre beyond the wall that it meets first, and into nothing."""
+    world, scan = l_room(), scan_of(exact)
+    start, end = np.asarray(world.start, float), np.asarray(world.end, float)
+    heading, here = np.arctan2(way[1], way[0]), np.asarray(POSE, float)
+    (met,) = cast_walls(start, end, here[:2], [heading], 50.0)
+    step = (met + 0.5) * np.array([np.cos(heading), np.sin(heading), 0.0])
+    beyond = POSE + jnp.asarray(step, float)
+    assert float(walls_met(world, scan, beyond)) < 0.4
+    assert float(walls_met(world, scan, beyond)) < float(walls_met(world, scan, POSE))
+
+
+def test_a_wall_on_the_way_counts_against(exact):
+    """Where rays are probed, and for what rays are worth; beside them it does not."""
+    clear = float(walls_met(l_room(), scan_of(exact), POSE))
+    outline = (
+        np.array([[-2, -1], [4, -1], [4, 1.5], [1, 1.5], [1, 5], [-2, 5]]) + CENTRE
+    )
+    longest = int(jnp.argmax(exact))
+    toward = float(POSE[2] + SENSOR.bearings[longest])
+    ahead, left = (
+        np.array([np.cos(a), np.sin(a)]) for a in (toward, toward + np.pi / 2)
+    )
+    middle = np.asarray(POSE, float)[:2] + 0.55 * float(exact[longest]) * ahead
+    wall = middle + np.outer([-0.6, 0.6, 0.6], left) + [[0, 0], [0, 0], [1e-3, 1e-3]]
+    walled = PolygonMap.from_outlines(outline, wall)
+    assert float(walls_met(walled, scan_of(exact), POSE)) < clear - 0.005
+    # A ray that ends on that wall is better off than one that is said to pass it.
+    stopped = cast(walled, POSE, SENSOR.bearings, SENSOR.range_max)
+    assert float(jnp.min(stopped - exact)) < -1
+    found = float(walls_met(walled, scan_of(stopped), POSE))
+    assert found > float(walls_met(walled, scan_of(exact), POSE))
+
+
+def test_rays_that_say_nothing_meet_no_walls(exact):
+    keep = jnp.arange(180) % 3 > 0
+    garbage = jnp.where(keep, exact, 0.1 + 0.01 * jnp.arange(180))
+    one = walls_met(l_room(), scan_of(exact, keep), POSE)
+    other = walls_met(l_room(), scan_of(garbage, keep), POSE)
+    np.testing.assert_array_equal(one, other)
+    for ranges, valid in ((jnp.full(180, 2.0), False), (jnp.full(180, 99.0), True)):
+        assert np.isfinite(walls_met(l_room(), scan_of(ranges, valid), POSE))
+
+
+def test_on_walls_under_jit_and_vmap(exact):
+    world, scan = l_room(), scan_of(exact)
+    poses = POSE[None] + jnp.linspace(-0.3, 0.3, 5)[:, None]
+    many = jax.jit(jax.vmap(on_walls, (None, None, 0)))(world, scan, poses)
+    one = [walls_met(world, scan, pose) for pose in poses]
+    np.testing.assert_allclose(many, one, atol=1e-5)
+    np.testing.assert_allclose(on_walls(world, scan, poses[0]), one[0], atol=1e-5)

@@ -18,16 +18,15 @@ def distance_to_walls(start, end, points):
     return nearest
 
 
-def score_map(field, padded_shape, ranges, bearings, heading, spacing, reach, rules):
+def score_map(field, ranges, bearings, heading, spacing, reach, rules):
     """Σ w L(x + p) over the points p of a scan, at all nodes x of `field`.
 
-    Beyond the field lies emptiness up to `padded_shape`, and there the world comes
-    round again. End points share their vote bilinearly among the four nodes around
-    them; points inside the rays vote, negatively, for the nearest node.
+    Beyond the field lies emptiness. End points share their vote bilinearly among the
+    four nodes around them; points inside the rays vote, negatively, for the nearest
+    node.
 
     Args:
         field: (rows, columns) likelihood L at the nodes.
-        padded_shape: rows and columns after which the correlation repeats itself.
         ranges, bearings: (n,) rays; non-finite ranges are echoless, seen to `reach`.
         heading: direction of bearing 0 in the lattice's frame [rad].
         spacing: distance between nodes [m].
@@ -37,17 +36,17 @@ def score_map(field, padded_shape, ranges, bearings, heading, spacing, reach, ru
             they must lie [m].
     """
     through, through_weight, clear_of_wall = rules
-    padded = np.zeros(padded_shape)
-    padded[: field.shape[0], : field.shape[1]] = field
     rows, columns = field.shape
+    rim = int(np.ceil(reach / spacing)) + 1
+    around = np.pad(field, rim)
     near = ranges < reach
     weight = np.sqrt(np.clip(np.where(np.isfinite(ranges), ranges, 1e9), 0.3, 10.0))
     weight = weight / weight[near].sum()
     score = np.zeros(field.shape)
 
     def vote(row, column, share):
-        there = np.roll(padded, (-row, -column), axis=(0, 1))
-        score[:] += share * there[:rows, :columns]
+        i, j = rim + row, rim + column
+        score[:] += share * around[i : i + rows, j : j + columns]
 
     for r, bearing, w in zip(ranges, bearings, weight, strict=True):
         d = np.array([np.cos(heading + bearing), np.sin(heading + bearing)])
@@ -67,17 +66,65 @@ def score_map(field, padded_shape, ranges, bearings, heading, spacing, reach, ru
     return score
 
 
-def best_of_blocks(scores, allowed):
-    """Best score of each 6 headings × 2 rows × 2 columns of (headings, rows, columns)."""
-    scores = np.where(allowed, scores, -np.inf)
-    headings, rows, columns = scores.shape
-    best = [
-        scores[k : k + 6, i : i + 2, j : j + 2].max()
-        for k in range(0, headings, 6)
-        for i in range(0, rows, 2)
-        for j in range(0, columns, 2)
-    ]
-    return np.sort(best)[::-1]
+def best_of_pairs(scores, allowed):
+    """Best scores of each two headings at each allowed node, sorted, best first.
+
+    Args:
+        scores: (headings, rows, columns).
+        allowed: (rows, columns).
+    """
+    best = np.maximum(scores[::2], scores[1::2])
+    return np.sort(best[:, allowed].ravel())[::-1]
+
+
+def shell_counts(ranges, counted, width, number):
+    """Rays that end in each of so many shells of that width, one ray at a time."""
+    count = np.zeros(number, int)
+    for r, counts in zip(ranges, counted, strict=True):
+        if counts and r < number * width:
+            count[int(r // width)] += 1
+    return count
+
+
+def share_explained(scan, counted, place, shift, width):
+    """Share of a scan's counted rays that end where a place's do, or a shell beside.
+
+    Args:
+        scan: (rays,) ranges [m], equiangular over the circle.
+        counted: (rays,) which of them count.
+        place: (rays,) ranges from the place [m].
+        shift: by how many rays the sensor is turned.
+        width: of a shell [m].
+    """
+    apart = np.abs(scan // width - np.roll(place, -shift) // width)
+    return np.mean(apart[counted] <= 1)
+
+
+def on_walls(distance, scan, pose, rules):
+    """Weight of the echoes that end on walls, less that of ways along or through some.
+
+    Args:
+        distance: (n, 2) points to distances from the nearest wall [m].
+        scan: the scan.
+        pose: of the lidar [m, m, rad].
+        rules: `(shares, near, clear_of_wall)`: where along a ray it is probed, the σ of
+            "on a wall" [m], and how far from its end a probe must lie [m].
+    """
+    shares, near, clear_of_wall = rules
+    on_wall = lambda point: np.exp(-0.5 * (distance(point[None])[0] / near) ** 2)
+    rays = scan.ranges, scan.bearings, scan.valid, scan.echo
+    gain = loss = weight = 0.0
+    for r, b, valid, echo in zip(*(np.asarray(a).tolist() for a in rays), strict=True):
+        heading = pose[2] + b
+        say = np.clip(r, 0.3, 10.0) ** 0.25
+        ray = r * np.array([np.cos(heading), np.sin(heading)])
+        if echo:
+            weight += say
+            gain += say * on_wall(pose[:2] + ray)
+        for share in shares:
+            if valid and (1 - share) * r > clear_of_wall:
+                loss += 0.5 * say / len(shares) * on_wall(pose[:2] + share * ray)
+    return (gain - loss) / weight
 
 
 def range_jacobian(start, end, pose, bearings):

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fsmsm_jax.world import OccupancyGrid
+from fsmsm_jax.world import OccupancyGrid, occupancy
 from tests.worlds import random_cells, random_grid
 
 
@@ -47,6 +47,20 @@ def test_empty_map_is_far_from_everything():
 def test_a_huge_empty_map_keeps_a_safe_clearance():
     grid = OccupancyGrid.from_cells(np.zeros((600, 600), int), 0.05, (5, -3, 1))
     assert grid.clearance.max() == 255  # capped, not wrapped around uint8
+
+
+@pytest.mark.parametrize("unknown", ["transparent", "opaque"])
+def test_large_maps_are_made_in_bands_without_a_seam(monkeypatch, unknown):
+    whole = random_grid(6, 90, 60, unknown=unknown)
+    monkeypatch.setattr(occupancy, "_BAND", 16)
+    jax.tree.map(
+        np.testing.assert_array_equal, random_grid(6, 90, 60, unknown=unknown), whole
+    )
+    monkeypatch.setattr(occupancy, "_BAND", 200)  # from 255 cells on, all is far
+    open_space = OccupancyGrid.from_cells(np.zeros((620, 600), int), 0.1)
+    row, column = np.mgrid[:622, :602]
+    to_edge = np.minimum(np.minimum(row, 621 - row), np.minimum(column, 601 - column))
+    np.testing.assert_array_equal(open_space.clearance, np.minimum(to_edge, 255))
 
 
 def test_slopes_rise_into_the_wall():
