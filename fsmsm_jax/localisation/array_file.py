@@ -20,7 +20,16 @@ from jaxtyping import Array
 
 __all__ = ["UNREADABLE", "read_arrays", "write_arrays"]
 
-UNREADABLE = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
+UNREADABLE = (
+    OSError,
+    KeyError,
+    ValueError,
+    TypeError,
+    EOFError,
+    NotImplementedError,
+    struct.error,
+    zipfile.BadZipFile,
+)
 """What reading a file that is none of ours, or no more, may raise."""
 
 _NAME_LENGTHS = 26  # where a member's local header tells the lengths of its name
@@ -54,7 +63,7 @@ def write_arrays(
         with zipfile.ZipFile(unfinished, "w") as archive:
             for key, array in arrays.items():
                 with archive.open(f"{key}.npy", "w", force_zip64=True) as file:
-                    np.lib.format.write_array(file, np.asarray(array))
+                    np.lib.format.write_array(file, np.asarray(array, order="C"))
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 descr = np.lib.format.dtype_to_descr(dtype)
                 header = {"descr": descr, "fortran_order": False, "shape": shape}

@@ -123,6 +123,11 @@ class ScanAtlas(eqx.Module):
             fingerprint = str(kept["fingerprint"])
             lattice = Lattice(jnp.asarray(kept["frame"]), config.spacing)
             tiles = [kept[name] for name in _OF_TILES]
+            *_, allowed, told = (array.shape for array in tiles)
+            if told != (*allowed, bins(config.reach)) or (
+                {len(array) for array in tiles} != {allowed[0]}
+            ):
+                raise ValueError("its arrays do not fit together")
         except UNREADABLE as error:
             raise ValueError(
                 f"cannot read a scan atlas from {path} ({error}); {anew}"
@@ -277,7 +282,8 @@ def _spacing_that_fits(world, config, size, allowed) -> str:
     """What to do about an atlas that is too large: its bytes go with 1 / spacing²."""
     spacing = config.spacing
     for _ in range(_TRIES):
-        spacing = round(spacing * max(1.05, 1.02 * np.sqrt(size / allowed)), 2)
+        wider = spacing * max(1.05, 1.02 * np.sqrt(size / max(allowed, 1)))
+        spacing = float(np.ceil(100 * wider) / 100)  # up, or fine ones stay as they are
         coarser = dataclasses.replace(config, spacing=spacing)
         try:
             size = memory_estimate(world, coarser)
@@ -285,7 +291,7 @@ def _spacing_that_fits(world, config, size, allowed) -> str:
             break
         if size <= allowed:
             return f"a spacing of {spacing:g} m would fit, with {size / 1e6:.1f} MB"
-    return "no spacing would fit; fewer rays, or more memory"
+    return "no spacing would fit; try a shorter reach, or more memory"
 
 
 def _fingerprint(world) -> str:

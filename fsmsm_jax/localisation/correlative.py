@@ -43,7 +43,8 @@ _THROUGH_WEIGHT = 0.5  # of all probes of a ray, against its end point's 1
 _CLEAR_OF_WALL = 0.75  # [m] probes nearer to the end point would blur into its wall
 _SECTOR = 2  # neighbouring headings of which only the better is kept
 _TICKS = 1 << 20  # in which scores are told: float32 holds them exactly
-_NOWHERE = -2.0  # score of a node where none may stand; true ones are above −1
+_NOWHERE = -2.0  # score of a node where none may stand
+_LEAST = -1.5  # others' at least: few echoes and long ways sum up to less
 
 
 class Ranking(NamedTuple):
@@ -102,7 +103,7 @@ def rank_tiles(
     def correlate(spectrum, left):
         score = jnp.fft.irfft2(scan * spectrum[None], s=(side, side))
         score = score[:, rim : rim + core, rim : rim + core]
-        score = jnp.where(left[None], score, _NOWHERE)
+        score = jnp.where(left[None], jnp.maximum(score, _LEAST), _NOWHERE)
         pairs = score.reshape(-1, _SECTOR, core, core)
         # One whole number holds score and heading, for XLA's argmax is slow on the CPU;
         # a float, for its top_k sorts everything if it is given integers.

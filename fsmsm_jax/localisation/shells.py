@@ -27,8 +27,8 @@ from fsmsm_jax.sensing.panorama import panorama
 __all__ = ["bins", "places_left", "scan_shells", "shells"]
 
 _WIDTH = 0.5  # of a shell [m]
-_LEAST = 0.85  # E of places that are kept in any case ...
-_BEHIND = 0.15  # ... as are those so little behind the best
+_LEAST = 0.7  # E of places that are kept in any case ...
+_BEHIND = 0.25  # ... as are those so little behind the best
 
 
 def bins(reach: float) -> int:
@@ -43,9 +43,11 @@ def shells(ranges: Float[Array, "rays"], reach: float) -> UInt8[Array, "bins"]:
         ranges: of the panorama [m]; those beyond the reach are in none.
         reach: [m]; static.
     """
-    count = _counts(ranges, jnp.ones(ranges.shape, bool), bins(reach))
-    around = jnp.pad(count, 1)
-    return jnp.minimum(around[:-2] + count + around[2:], 255).astype(jnp.uint8)
+    # One more than asked for: the last shell, too, has one beside it.
+    count = _counts(ranges, jnp.ones(ranges.shape, bool), bins(reach) + 1)
+    around = jnp.pad(count, (1, 0))
+    three = around[:-2] + around[1:-1] + around[2:]
+    return jnp.minimum(three, 255).astype(jnp.uint8)
 
 
 def scan_shells(scan: Scan, rays: int, reach: float) -> Int[Array, "bins"]:

@@ -105,7 +105,8 @@ class Cut(NamedTuple):
 
     def bytes(self, bins: int) -> int:
         """What the tiles will hold, with so many shells a node."""
-        spectrum = 8 * self.side * (self.side // 2 + 1)
+        number = np.dtype(jax.dtypes.canonicalize_dtype(complex)).itemsize
+        spectrum = number * self.side * (self.side // 2 + 1)
         return len(self.corner) * (spectrum + 8) + self.allowed.size * (1 + bins)
 
 
