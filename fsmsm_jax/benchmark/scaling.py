@@ -7,15 +7,18 @@ the most that a map, a scan or a batch may cost; below it, something is shared.
 The number of devices is fixed when a process starts, so each has a process of its own,
 which makes that many out of the host's cores (`xla_force_host_platform_device_count`).
 They share the cores there are: such a curve shows what dividing the work costs, not
-what more machines would bring.
+what more machines would bring. Divided are poses to cast from, and the tiles of a map
+in which a scan is looked for.
 """
 
 import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -32,7 +35,7 @@ from fsmsm_jax.benchmark.stages import (
     rays_from,
     simulated_scans,
 )
-from fsmsm_jax.localisation.atlas import build_atlas
+from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas, build_atlas
 from fsmsm_jax.localisation.search import localise, localise_batch
 from fsmsm_jax.sensing.lidar import Lidar
 from fsmsm_jax.sensing.raycast import raycast
@@ -43,6 +46,7 @@ __all__ = ["CURVES", "Curve", "report_devices"]
 _SIDES = ((20.0, 12.5), (40.0, 25.0), (160.0, 100.0))  # [m]
 _RAYS = (90, 360, 1440)
 _DEVICES = (1, 2, 4, 8)
+_FINE = AtlasConfig(spacing=0.4, reach=8.0)  # six tiles of the largest floor, not one
 _POSES = 1024  # of a ray cast
 _PATIENCE = 300  # [s] with a process of many devices
 _REPEATS = 5  # of a time on a curve
@@ -123,37 +127,51 @@ def devices(scene: Scene) -> Iterator[Curve]:
     """One to eight devices made of the same cores."""
     del scene
     times: dict[str, list] = {}
-    for count in _DEVICES:
-        flags = f"{os.environ.get('XLA_FLAGS', '')} "
-        flags += f"--xla_force_host_platform_device_count={count}"
-        environment = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
-        code = (
-            "from fsmsm_jax.benchmark.scaling import report_devices; report_devices()"
-        )
-        try:
-            answer = subprocess.run(
-                [sys.executable, "-c", code],
-                env=os.environ | environment,
-                stdout=subprocess.PIPE,
-                text=True,
-                check=True,
-                timeout=_PATIENCE,
-            ).stdout
-        except subprocess.SubprocessError as error:
-            raise ChildProcessError(
-                f"no times from a process with {count} host devices ({error})"
-            ) from error
-        for label, quartiles in json.loads(answer.splitlines()[-1]).items():
-            times.setdefault(label, []).append(tuple(quartiles))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "atlas.npz")
+        build_atlas(office(0, *_SIDES[-1]), _FINE).save(path)
+        for count in _DEVICES:
+            for label, quartiles in _asked_of(count, path).items():
+                times.setdefault(label, []).append(tuple(quartiles))
     sizes = [float(count) for count in _DEVICES]
     for label, quartiles in times.items():
         yield Curve("devices", label, "devices on one host", sizes, quartiles)
 
 
-def report_devices() -> None:
-    """Print as JSON what work divided among all devices of this process takes."""
+def _asked_of(count: int, atlas: Path) -> dict[str, list[float]]:
+    """What `report_devices` tells in a process of so many devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} "
+    flags += f"--xla_force_host_platform_device_count={count}"
+    environment = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    code = "import sys; from fsmsm_jax.benchmark.scaling import report_devices; "
+    code += "report_devices(sys.argv[1])"
+    try:
+        answer = subprocess.run(
+            [sys.executable, "-c", code, str(atlas)],
+            env=os.environ | environment,
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+            timeout=_PATIENCE,
+        ).stdout
+    except subprocess.SubprocessError as error:
+        raise ChildProcessError(
+            f"no times from a process with {count} host devices ({error})"
+        ) from error
+    return json.loads(answer.splitlines()[-1])
+
+
+def report_devices(path: str | Path) -> None:
+    """Print as JSON what work divided among all devices of this process takes.
+
+    Args:
+        path: of the atlas to spread; by itself if there is one device only.
+    """
     scene = Scene(Amounts.of_device())
     mesh = Mesh(np.array(jax.devices()), ("poses",))
+    floor = office(0, *_SIDES[-1])
+    atlas = ScanAtlas.load(path, floor, mesh if mesh.size > 1 else None)
+    scan = jax.tree.map(lambda a: a[0], simulated_scans(floor, 1)[0])
     everywhere, divided = PartitionSpec(), PartitionSpec("poses")
     poses = random_poses(scene.world, _POSES)
     poses = jax.device_put(poses, NamedSharding(mesh, divided))
@@ -172,7 +190,10 @@ def report_devices() -> None:
     def cast(world, poses):
         return jax.vmap(lambda pose: raycast(world, pose, bearings, 30.0))(poses)
 
-    work = {f"raycast, {_POSES} scans": lambda: cast(scene.world, poses)}
+    work = {
+        f"raycast, {_POSES} scans": lambda: cast(scene.world, poses),
+        f"localise, {len(atlas.tiles.corner)} tiles": lambda: localise(atlas, scan),
+    }
     print(json.dumps({label: _quartiles(one) for label, one in work.items()}))
 
 

@@ -150,6 +150,14 @@ class ScanAtlas(eqx.Module):
         `localise` is called as before. With several processes each makes or loads the
         atlas, spreads it over a mesh of all devices, and calls `localise` with the same
         scans in the same order; the map itself stays on each process's first device.
+
+        Example, of two processes; join before anything else of JAX is used:
+            jax.distributed.initialize("host:1234", num_processes=2, process_id=n,
+                heartbeat_timeout_seconds=10, shutdown_timeout_seconds=30)
+
+        If a process crashes, the next `localise` of the others raises, or they are
+        ended after the first limit; if one raises and ends, after the second. JAX's
+        own limits are 100 s and 300 s.
         """
         tiles = spread(jax.tree.leaves(self.tiles), mesh)
         return eqx.tree_at(lambda atlas: atlas.tiles, self, tiles)

@@ -27,8 +27,8 @@ from fsmsm_jax.sensing.panorama import panorama
 __all__ = ["bins", "places_left", "scan_shells", "shells"]
 
 _WIDTH = 0.5  # of a shell [m]
-_LEAST = 0.7  # E of places that are kept in any case ...
-_BEHIND = 0.25  # ... as are those so little behind the best
+_LEAST = 0.85  # E of places that are kept in any case ...
+_BEHIND = 0.15  # ... as are those so little behind the best
 
 
 def bins(reach: float) -> int:
