@@ -12,7 +12,7 @@ import pytest
 from fsmsm_jax import cli
 from fsmsm_jax.io.programs import platform_here
 from fsmsm_jax.io.stored import load_tracker
-from fsmsm_jax.localisation.atlas import AtlasConfig, build_atlas
+from fsmsm_jax.localisation import AtlasConfig, build_atlas
 from fsmsm_jax.sensing import Lidar, raycast
 from fsmsm_jax.world.buildings import office
 from fsmsm_jax.world.ros_map import save_map

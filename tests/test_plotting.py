@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fsmsm_jax.geometry import transform_points
-from fsmsm_jax.localisation.search import Candidates, Localisation
+from fsmsm_jax.localisation.settle import Candidates, Localisation
 from fsmsm_jax.sensing import Lidar, raycast
 from fsmsm_jax.world import OccupancyGrid, PolygonMap
 

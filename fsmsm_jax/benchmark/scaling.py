@@ -35,7 +35,8 @@ from fsmsm_jax.benchmark.stages import (
     rays_from,
     simulated_scans,
 )
-from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas, build_atlas
+from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas
+from fsmsm_jax.localisation.atlas_build import build_atlas
 from fsmsm_jax.localisation.search import localise, localise_batch
 from fsmsm_jax.sensing.lidar import Lidar
 from fsmsm_jax.sensing.raycast import raycast

@@ -23,7 +23,8 @@ from fsmsm_jax.alignment.orientation import fourier_mellin
 from fsmsm_jax.benchmark.clock import clock
 from fsmsm_jax.benchmark.metric import Metric
 from fsmsm_jax.localisation import particles, tracker
-from fsmsm_jax.localisation.atlas import ScanAtlas, build_atlas
+from fsmsm_jax.localisation.atlas import ScanAtlas
+from fsmsm_jax.localisation.atlas_build import build_atlas
 from fsmsm_jax.localisation.clouds import init_at
 from fsmsm_jax.localisation.search import localise, localise_batch
 from fsmsm_jax.resampling import Kld

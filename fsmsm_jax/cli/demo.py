@@ -46,7 +46,7 @@ def demo(seed: int = 0, picture: Path = Path("demo.png")) -> None:
     result, first, warm = localise_twice(scan_atlas, scan)
     print(report(result, {"atlas": atlas_time, "first_query": first, "query": warm}))
     x, y, theta = np.asarray(truth, float)
-    error = np.asarray(between(truth, result.pose), float)
+    error = np.asarray(between(truth, jnp.asarray(result.pose)), float)
     print(
         f"truth     x {x:.3f} m, y {y:.3f} m, heading {np.rad2deg(theta):.2f}°: off by "
         f"{1e3 * np.hypot(*error[:2]):.0f} mm and {abs(np.rad2deg(error[2])):.2f}°"

@@ -22,8 +22,9 @@ from fsmsm_jax.cli.console import (
 from fsmsm_jax.io.logs import read_scans
 from fsmsm_jax.io.stored import ANSWER
 from fsmsm_jax.localisation import search
-from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas, build_atlas
-from fsmsm_jax.localisation.search import Localisation, SearchConfig
+from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas
+from fsmsm_jax.localisation.atlas_build import build_atlas
+from fsmsm_jax.localisation.settle import Localisation, SearchConfig
 from fsmsm_jax.sensing.buckets import padded
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid

@@ -21,12 +21,8 @@ from jaxtyping import Array, Float, Shaped
 from fsmsm_jax.io.programs import Program
 from fsmsm_jax.localisation import search, tracker
 from fsmsm_jax.localisation.atlas import ScanAtlas
-from fsmsm_jax.localisation.search import (
-    Candidates,
-    Localisation,
-    SearchConfig,
-    check_echoes,
-)
+from fsmsm_jax.localisation.search import check_echoes
+from fsmsm_jax.localisation.settle import Candidates, Localisation, SearchConfig
 from fsmsm_jax.localisation.tracker import TrackerConfig, TrackerInfo, TrackerState
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid
@@ -71,7 +67,7 @@ class StoredTracker:
     ) -> TrackerState:
         """A tracker that starts from a pose; see `tracker.init`."""
         given = (None if a is None else jnp.asarray(a) for a in (covariance, odometry))
-        return tracker.init(_anywhere(), jnp.asarray(pose, float), *given)
+        return tracker.init(None, jnp.asarray(pose, float), *given)
 
     def step(
         self,
@@ -208,11 +204,6 @@ def load_query(path: str | Path) -> StoredQuery:
             this machine's platform.
     """
     return StoredQuery(Program.load(path, "query"))
-
-
-def _anywhere() -> PolygonMap:
-    """A map, because `tracker.init` takes one; it does not look at it."""
-    return PolygonMap.from_outlines([[0, 0], [1, 0], [0, 1]])
 
 
 def _check(scan) -> None:

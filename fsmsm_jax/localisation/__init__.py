@@ -3,12 +3,16 @@
 from fsmsm_jax.localisation.atlas import (
     AtlasConfig as AtlasConfig,
     ScanAtlas as ScanAtlas,
+)
+from fsmsm_jax.localisation.atlas_build import (
     build_atlas as build_atlas,
     memory_estimate as memory_estimate,
 )
-from fsmsm_jax.localisation.search import (
+from fsmsm_jax.localisation.settle import (
     Localisation as Localisation,
     SearchConfig as SearchConfig,
+)
+from fsmsm_jax.localisation.search import (
     localise as localise,
     localise_batch as localise_batch,
 )

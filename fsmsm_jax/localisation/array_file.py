@@ -26,8 +26,8 @@ UNREADABLE = (
     ValueError,
     TypeError,
     EOFError,
-    NotImplementedError,
-    struct.error,
+    NotImplementedError,  # of zipfile: a way of compressing that it does not know
+    struct.error,  # of a header's lengths, where the file ends too soon
     zipfile.BadZipFile,
 )
 """What reading a file that is none of ours, or no more, may raise."""

@@ -16,7 +16,8 @@ from fsmsm_jax import geometry
 from fsmsm_jax.localisation.atlas import ScanAtlas
 from fsmsm_jax.localisation.feedback import gaussian_cloud
 from fsmsm_jax.localisation.particles import ParticleConfig, Particles
-from fsmsm_jax.localisation.search import SearchConfig, localise
+from fsmsm_jax.localisation.search import localise
+from fsmsm_jax.localisation.settle import SearchConfig
 from fsmsm_jax.resampling import systematic
 from fsmsm_jax.sensing import Scan
 from fsmsm_jax.world import OccupancyGrid, PolygonMap

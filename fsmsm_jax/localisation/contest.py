@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from fsmsm_jax.localisation import tracker
-from fsmsm_jax.localisation.search import Candidates
+from fsmsm_jax.localisation.settle import Candidates
 from fsmsm_jax.localisation.tracker import TrackerConfig, TrackerInfo, TrackerState
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid

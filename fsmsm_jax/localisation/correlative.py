@@ -19,16 +19,19 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from fsmsm_jax import geometry
 from fsmsm_jax.localisation.atlas import AtlasConfig, ScanAtlas
+from fsmsm_jax.localisation.judge import CLEAR_OF_WALL, IN_THE_WAY, ON_THE_WAY
 from fsmsm_jax.localisation.lattice import Lattice
 from fsmsm_jax.localisation.shells import places_left, scan_shells
 from fsmsm_jax.localisation.tiles import Tiles
 from fsmsm_jax.sensing.lidar import Scan
 
 __all__ = [
+    "Box",
     "Ranking",
     "all_headings",
     "best_of_all",
@@ -38,11 +41,9 @@ __all__ = [
     "tiles_left",
 ]
 
-_THROUGH = (0.3, 0.55, 0.8)  # where along a ray its free space is probed
-_THROUGH_WEIGHT = 0.5  # of all probes of a ray, against its end point's 1
-_CLEAR_OF_WALL = 0.75  # [m] probes nearer to the end point would blur into its wall
-_SECTOR = 2  # neighbouring headings of which only the better is kept
-_TICKS = 1 << 20  # in which scores are told: float32 holds them exactly
+_BLOCK = 0.8  # [m]: of the poses in a block and a sector only the best is listed, ...
+_SECTOR = 24.0  # ... [deg]: a descent's basin, from whose middle it finds its way
+_WHOLE = 1 << 23  # numbers up to it, and their halves, are told exactly in float32
 _NOWHERE = -2.0  # score of a node where none may stand
 _LEAST = -1.5  # others' at least: few echoes and long ways sum up to less
 
@@ -56,6 +57,32 @@ class Ranking(NamedTuple):
     """At most 1; −2 where there were no more poses."""
 
 
+class Box(NamedTuple):
+    """Poses so near each other that the descent from one of them serves all."""
+
+    headings: int
+    """Neighbouring headings; a divisor of all."""
+    nodes: int
+    """Neighbouring rows and columns; a tile's last box may have fewer."""
+
+    @classmethod
+    def of(cls, spacing: float, headings: int) -> "Box":
+        """The box of a lattice spacing [m] and a number of headings."""
+        most = max(1, int(headings * _SECTOR / 360))
+        sector = max(n for n in range(1, most + 1) if headings % n == 0)
+        return cls(sector, max(1, round(_BLOCK / spacing)))
+
+    def per_core(self, headings: int, core: int) -> tuple[int, int, int]:
+        """How many boxes cover a core's headings, rows and columns."""
+        side = -(-core // self.nodes)
+        return headings // self.headings, side, side
+
+    @property
+    def ticks(self) -> int:
+        """In which scores are told, so that a place in the box fits in beside them."""
+        return _WHOLE // (self.headings * self.nodes**2)
+
+
 def rank_poses(atlas: ScanAtlas, scan: Scan, headings: int, count: int) -> Ranking:
     """The best lattice poses for a scan, apart from each other, best first.
 
@@ -63,14 +90,15 @@ def rank_poses(atlas: ScanAtlas, scan: Scan, headings: int, count: int) -> Ranki
         atlas: the map's atlas.
         scan: the real scan; echoes within the atlas's reach vote.
         headings: how many headings to try, an even number (static).
-        count: how many poses to return at most (static). Of two neighbouring headings
-            at one node only the better is listed.
+        count: how many poses to return at most (static). Of the poses in a `Box` only
+            the best is listed.
     """
     tiles, config = atlas.tiles, atlas.config
     left = tiles_left(tiles, config, scan)
     spectra = scan_spectra(config, tiles.side, scan, all_headings(headings))
-    listed = rank_tiles(tiles.spectra, left, spectra, count)
-    return best_of_all(listed, tiles, atlas.lattice, headings, count)
+    box = Box.of(config.spacing, headings)
+    listed = rank_tiles(tiles.spectra, left, spectra, box, count)
+    return best_of_all(listed, tiles, atlas.lattice, headings, box, count)
 
 
 def tiles_left(
@@ -85,35 +113,43 @@ def rank_tiles(
     tiles: Complex[Array, "tiles side half_side"],
     left: Bool[Array, "tiles core core"],
     scan: Complex[Array, "headings side half_side"],
+    box: Box,
     count: int,
 ) -> tuple[Float[Array, "tiles few"], Int[Array, "tiles few"]]:
-    """Each tile's best: score and heading in one number, and where that is.
+    """Each tile's best: score and place in the box in one number, and which box.
 
     Args:
         tiles: spectra of the likelihood field.
         left: nodes that are not ruled out; a tile without any is skipped.
         scan: conjugate spectra of the scan's images.
+        box: of which only the best is listed.
         count: how many to list, at most.
     """
     headings, side, _ = scan.shape
     core = left.shape[-1]
     rim = (side - core) // 2
-    few = min(count, headings // _SECTOR * core**2)
+    boxes = box.per_core(headings, core)
+    few = min(count, int(np.prod(boxes)))
+    shape = tuple(np.stack([boxes, (box.headings, box.nodes, box.nodes)], 1).ravel())
 
     def correlate(spectrum, left):
         score = jnp.fft.irfft2(scan * spectrum[None], s=(side, side))
         score = score[:, rim : rim + core, rim : rim + core]
         score = jnp.where(left[None], jnp.maximum(score, _LEAST), _NOWHERE)
-        pairs = score.reshape(-1, _SECTOR, core, core)
-        # One whole number holds score and heading, for XLA's argmax is slow on the CPU;
+        fill = (0, boxes[1] * box.nodes - core)
+        score = jnp.pad(score, ((0, 0), fill, fill), constant_values=_NOWHERE)
+        # One whole number holds score and place, for XLA's argmax is slow on the CPU;
         # a float, for its top_k sorts everything if it is given integers.
-        which = jnp.arange(_SECTOR, dtype=score.dtype)[None, :, None, None]
-        pairs = jnp.round(pairs * _TICKS) * _SECTOR + which
-        return tuple(jax.lax.top_k(pairs.max(axis=1).reshape(-1), few))
+        score = jnp.round(score.reshape(shape) * box.ticks)
+        places = box.headings * box.nodes**2
+        place = jnp.arange(places, dtype=score.dtype)
+        place = place.reshape(1, box.headings, 1, box.nodes, 1, box.nodes)
+        best = (score * places + place).max(axis=(1, 3, 5))
+        return tuple(jax.lax.top_k(best.reshape(-1), few))
 
     def skip(spectrum, left):
-        nothing = jnp.full(few, _NOWHERE * _TICKS * _SECTOR, scan.real.dtype)
-        return nothing, jnp.zeros(few, jnp.int32)
+        nothing = _NOWHERE * box.ticks * box.headings * box.nodes**2
+        return jnp.full(few, nothing, scan.real.dtype), jnp.zeros(few, jnp.int32)
 
     one = lambda tile: jax.lax.cond(jnp.any(tile[1]), correlate, skip, *tile)
     return jax.lax.map(one, (tiles, left))
@@ -124,21 +160,26 @@ def best_of_all(
     tiles: Tiles,
     lattice: Lattice,
     headings: int,
+    box: Box,
     count: int,
 ) -> Ranking:
     """The best of the tiles' best (`rank_tiles`), as poses in the map."""
-    value, place = listed
+    value, which = listed
     few, core = value.shape[1], tiles.core
     value, index = jax.lax.top_k(value.reshape(-1), min(count, value.size))
-    tile, place = index // few, place.reshape(-1)[index]
-    sector, row, column = jnp.unravel_index(place, (headings // _SECTOR, core, core))
+    tile, which = index // few, which.reshape(-1)[index]
+    places = box.headings * box.nodes**2
+    score = jnp.floor(value / places)
+    place = (value - score * places).astype(int)
+    first = jnp.unravel_index(which, box.per_core(headings, core))
+    inside = jnp.unravel_index(place, (box.headings, box.nodes, box.nodes))
+    heading = first[0] * box.headings + inside[0]
+    row, column = (first[n] * box.nodes + inside[n] for n in (1, 2))
     corner = tiles.corner[tile]
     position = lattice.to_map(corner[:, 0] + row, corner[:, 1] + column)
-    score = jnp.floor(value / _SECTOR)
-    heading = sector * _SECTOR + (value - score * _SECTOR).astype(int)
     turned = geometry.wrap(all_headings(headings)[heading, None] + lattice.frame[2])
     poses = jnp.concatenate([position, turned], axis=1)
-    return Ranking(poses, score / _TICKS)
+    return Ranking(poses, score / box.ticks)
 
 
 def all_headings(count: int) -> Float[Array, "count"]:
@@ -177,12 +218,12 @@ def _scan_image(config, side, scan, theta):
             y.append(corner[:, 1] + dy)
             w.append(jnp.where(near, share_x * share_y, 0.0) * weight)
     seen = jnp.minimum(scan.ranges, reach)
-    for share in _THROUGH:
+    for share in ON_THE_WAY:
         probe = jnp.round(direction * (share * seen / spacing)[:, None])
-        clear = scan.valid & ((1 - share) * seen > _CLEAR_OF_WALL)
+        clear = scan.valid & ((1 - share) * seen > CLEAR_OF_WALL)
         x.append(probe[:, 0])
         y.append(probe[:, 1])
-        w.append(jnp.where(clear, -_THROUGH_WEIGHT / len(_THROUGH) * weight, 0.0))
+        w.append(jnp.where(clear, -IN_THE_WAY / len(ON_THE_WAY) * weight, 0.0))
     x, y = (jnp.concatenate(a).astype(jnp.int32) for a in (x, y))
     index = (y % side) * side + x % side
     image = jnp.zeros(side * side, scan.ranges.dtype).at[index].add(jnp.concatenate(w))

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from fsmsm_jax.localisation.atlas import ScanAtlas
-from fsmsm_jax.localisation.search import Localisation, SearchConfig
+from fsmsm_jax.localisation.settle import Localisation, SearchConfig
 from fsmsm_jax.localisation.stream import (
     Query,
     answers,

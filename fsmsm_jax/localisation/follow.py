@@ -32,7 +32,8 @@ from fsmsm_jax.localisation.contest import (
     leader,
     winner,
 )
-from fsmsm_jax.localisation.search import Localisation, SearchConfig, localise
+from fsmsm_jax.localisation.search import localise
+from fsmsm_jax.localisation.settle import Localisation, SearchConfig
 from fsmsm_jax.localisation.tracker import TrackerConfig, TrackerInfo, TrackerState
 from fsmsm_jax.sensing.buckets import padded, padded_rays
 from fsmsm_jax.sensing.lidar import Scan

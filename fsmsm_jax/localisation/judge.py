@@ -28,7 +28,15 @@ from fsmsm_jax.sensing.raycast import raycast
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
 
-__all__ = ["Evidence", "explain", "on_walls", "trust"]
+__all__ = [
+    "CLEAR_OF_WALL",
+    "IN_THE_WAY",
+    "ON_THE_WAY",
+    "Evidence",
+    "explain",
+    "on_walls",
+    "trust",
+]
 
 _SIGMA = 0.1  # [m]: map and sensor errors of a ray that the map does explain
 _UNMAPPED, _TOO_SHORT, _TOO_LONG = 0.3, 0.1, 0.05  # ε, by what may have happened
@@ -36,8 +44,9 @@ _NO_ECHO_WEIGHT = 0.1  # glass, black things and sky make missing echoes poor wi
 _THICKEST = 0.06  # [m]: walls drawn thicker than this are another place's walls
 _EXPLAINED = 0.3  # [m]: a ray that reads or ends this close to the map fits it
 _NEAR = 0.15  # [m]: σ of "on a wall" before the pose is polished
-_ON_THE_WAY = (0.3, 0.55, 0.8)  # where along a ray its free space is probed
-_CLEAR_OF_WALL = 0.75  # [m]: probes nearer to the end point would feel its wall
+ON_THE_WAY = (0.3, 0.55, 0.8)  # where along a ray its free space is probed
+IN_THE_WAY = 0.5  # weight of a wall at all probes of a ray; of one at its end, 1
+CLEAR_OF_WALL = 0.75  # [m]: probes nearer to the end point would feel its wall
 _LEAD = 0.15  # lead of a sure answer over its best rival [nats a ray]
 _LEAD_PER_DOUBT = 0.75  # more of it per nat that the answer itself falls short
 _MOST = 0.6  # share of the rays that a sure answer explains
@@ -125,9 +134,9 @@ def on_walls(
         -0.5 * (world.distance_at(pose[None, :2] + share * along) / _NEAR) ** 2
     )
     score = jnp.where(scan.echo, near(1.0), 0.0)
-    for share in _ON_THE_WAY:
-        clear = scan.valid & ((1 - share) * scan.ranges > _CLEAR_OF_WALL)
-        score -= jnp.where(clear, 0.5 / len(_ON_THE_WAY) * near(share), 0.0)
+    for share in ON_THE_WAY:
+        clear = scan.valid & ((1 - share) * scan.ranges > CLEAR_OF_WALL)
+        score -= jnp.where(clear, IN_THE_WAY / len(ON_THE_WAY) * near(share), 0.0)
     return jnp.sum(say * score)
 
 
@@ -137,7 +146,7 @@ def trust(
     """Whether the first of the distinct candidates can be believed.
 
     Args:
-        scores: mean log-likelihood per ray of distinct candidates, best first.
+        scores: of distinct candidates, best first [nats a ray].
         best: evidence for the first of them.
         covariance: of the best pose [m, m, rad].
 
@@ -150,7 +159,7 @@ def trust(
         no guarantee.
     """
     lead = scores[0] - scores[1]
-    doubt = jnp.maximum(-scores[0] - best.blocked, 0.0)
+    doubt = jnp.maximum(-best.score - best.blocked, 0.0)
     fixed = jnp.sqrt(covariance[0, 0] + covariance[1, 1]) < _FIXED
     fits = (best.explained > _MOST) & (best.through < _HARDLY_ANY)
     return (lead > _LEAD + _LEAD_PER_DOUBT * doubt) & fits & fixed

@@ -22,6 +22,7 @@ from jaxtyping import Array
 
 from fsmsm_jax.localisation.atlas import ScanAtlas
 from fsmsm_jax.localisation.correlative import (
+    Box,
     Ranking,
     all_headings,
     best_of_all,
@@ -61,6 +62,7 @@ def rank_on_mesh(
 def _rank(tiles, lattice, scans, config, rays, headings, count, mesh):
     shared, whole = PartitionSpec(*mesh.axis_names), PartitionSpec()
     share = -(-headings // mesh.size)
+    box = Box.of(config.spacing, headings)
 
     @partial(
         jax.shard_map,
@@ -74,7 +76,7 @@ def _rank(tiles, lattice, scans, config, rays, headings, count, mesh):
         theta = all_headings(headings)[(device * share + jnp.arange(share)) % headings]
         some = scan_spectra(config, tiles.side, scan, theta)
         every = jax.lax.all_gather(some, mesh.axis_names, tiled=True)[:headings]
-        return rank_tiles(spectra, left, every, count)
+        return rank_tiles(spectra, left, every, box, count)
 
     def one(scan) -> Ranking:
         thin = scan.thin(rays)
@@ -82,7 +84,7 @@ def _rank(tiles, lattice, scans, config, rays, headings, count, mesh):
         gathered, near = jax.lax.with_sharding_constraint(
             (listed, tiles), NamedSharding(mesh, whole)
         )
-        return best_of_all(gathered, near, lattice, headings, count)
+        return best_of_all(gathered, near, lattice, headings, box, count)
 
     found = one(scans) if scans.ranges.ndim == 1 else jax.lax.map(one, scans)
     return jax.lax.with_sharding_constraint(found, NamedSharding(mesh, whole))

@@ -24,7 +24,8 @@ import jax
 import numpy as np
 
 from fsmsm_jax.localisation.atlas import ScanAtlas
-from fsmsm_jax.localisation.search import Localisation, SearchConfig, localise_batch
+from fsmsm_jax.localisation.search import localise_batch
+from fsmsm_jax.localisation.settle import Localisation, SearchConfig
 from fsmsm_jax.sensing.buckets import bucket, filled, power_of_two, stacked
 from fsmsm_jax.sensing.lidar import Scan
 

@@ -113,7 +113,7 @@ class TrackerInfo(NamedTuple):
 
 
 def init(
-    world: OccupancyGrid | PolygonMap,
+    world: OccupancyGrid | PolygonMap | None,
     pose: Float[Array, "3"],
     covariance: Float[Array, "3 3"] | None = None,
     odometry: Float[Array, "3"] | None = None,
@@ -121,7 +121,7 @@ def init(
     """A tracker that starts from a pose.
 
     Args:
-        world: the map.
+        world: the map; it is not looked at, and None will do.
         pose: of the lidar in the map frame [m, m, rad].
         covariance: of the pose [m, m, rad]²; 0.1 m and 3° if left out.
         odometry: what odometry read there [m, m, rad], if it did.

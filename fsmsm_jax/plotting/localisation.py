@@ -23,7 +23,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Affine2D
 
 from fsmsm_jax.geometry import transform_points
-from fsmsm_jax.localisation.search import Localisation
+from fsmsm_jax.localisation.settle import Localisation
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap

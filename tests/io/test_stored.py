@@ -10,9 +10,8 @@ import pytest
 
 from fsmsm_jax import geometry
 from fsmsm_jax.io.stored import load_query, load_tracker, save_query, save_tracker
-from fsmsm_jax.localisation import search, tracker
-from fsmsm_jax.localisation.atlas import AtlasConfig, build_atlas
-from fsmsm_jax.localisation.search import Candidates, Localisation, SearchConfig
+from fsmsm_jax.localisation import AtlasConfig, build_atlas, search, tracker
+from fsmsm_jax.localisation.settle import Candidates, Localisation, SearchConfig
 from fsmsm_jax.sensing import Lidar, Scan, raycast
 from tests.worlds import CENTRE, l_room
 

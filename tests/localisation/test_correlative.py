@@ -9,21 +9,22 @@ import numpy as np
 import pytest
 
 from fsmsm_jax import geometry
-from fsmsm_jax.localisation import AtlasConfig, build_atlas, correlative, tiles
-from fsmsm_jax.localisation.correlative import rank_poses
+from fsmsm_jax.localisation import AtlasConfig, build_atlas, judge, tiles
+from fsmsm_jax.localisation.correlative import Box, rank_poses
 from fsmsm_jax.localisation.lattice import lattice_over
 from fsmsm_jax.localisation.shells import places_left, scan_shells
 from fsmsm_jax.sensing import Lidar, Scan, raycast
 from fsmsm_jax.world import OccupancyGrid
-from tests.oracles.localisation import best_of_pairs, distance_to_walls, score_map
+from tests.oracles.localisation import best_of_boxes, distance_to_walls, score_map
 from tests.worlds import CENTRE, free_poses, l_room, random_cells
 
-HEADINGS = 24
+HEADINGS = 30
 CONFIG = AtlasConfig(spacing=0.5, rays=36, reach=6.0, softness=0.4)
 SHORT = AtlasConfig(spacing=0.25, rays=36, reach=1.6, softness=0.4)
 SENSOR = Lidar.create(90, noise=0.01, range_max=12.0)
-RULES = (correlative._THROUGH, correlative._THROUGH_WEIGHT, correlative._CLEAR_OF_WALL)
-# A score is told in ticks of 2⁻²⁰, and float32 transforms of some thousand numbers err
+RULES = (judge.ON_THE_WAY, judge.IN_THE_WAY, judge.CLEAR_OF_WALL)
+BOX, SHORT_BOX = (Box.of(config.spacing, HEADINGS) for config in (CONFIG, SHORT))
+# A score is told in ticks of about 2⁻²⁰, and float32 transforms of some thousand numbers err
 # by a few roundings of scores up to 1.
 EXACT = 2.0**-20 + 8 * 2.0**-23
 
@@ -134,15 +135,17 @@ def index_of(poses, spacing, corner, theta):
     return k, row, column
 
 
-def assert_same_as_sums(found, config, scan, left=None, exact=EXACT):
+def assert_same_as_sums(found, made, scan, left=None, exact=EXACT):
     """The list is that of the sums at the nodes that are left, score by score.
 
     Sums have no lower bound, since rays without echo have a say in the ways but not in
     the ends. Under −1 only the order counts, and that they are not taken for nothing.
     """
+    config, core = made.config, made.tiles.core
+    box = Box.of(config.spacing, HEADINGS)
     scores, corner, theta, allowed = all_scores(config, scan)
     left = allowed if left is None else left
-    wanted = best_of_pairs(scores, left)
+    wanted = best_of_boxes(scores, left, core, *box)
     told = np.asarray(found.score, float)
     real = told > -2
     assert real.sum() == len(wanted)
@@ -156,7 +159,11 @@ def assert_same_as_sums(found, config, scan, left=None, exact=EXACT):
     assert left[row, column].all()
     its = scores[k, row, column]
     np.testing.assert_allclose(told[likely], its[likely], atol=exact)
-    assert len({*zip(k // 2, row, column, strict=True)}) == len(wanted)
+    boxes = (
+        k // box.headings,
+        *(n // core * core + n % core // box.nodes for n in (row, column)),
+    )
+    assert len({*zip(*boxes, strict=True)}) == len(wanted)
     return wanted
 
 
@@ -164,7 +171,7 @@ def assert_same_as_sums(found, config, scan, left=None, exact=EXACT):
 def test_scores_are_the_sums_they_stand_for(atlas, kind):
     """Also where there are few echoes, and ways through all walls."""
     scan = SCANS[kind]()
-    wanted = assert_same_as_sums(rank_all(unruled(atlas), scan), CONFIG, scan)
+    wanted = assert_same_as_sums(rank_all(unruled(atlas), scan), atlas, scan)
     assert (wanted.min() < -2) == (kind == "lonely")
 
 
@@ -172,7 +179,7 @@ def test_scores_are_the_sums_they_stand_for(atlas, kind):
 def test_tiles_say_the_same(tiled, kind):
     """End points beyond a tile's core are seen in its rim, wherever its neighbour is."""
     scan = SCANS[kind]()
-    assert_same_as_sums(rank_all(unruled(tiled), scan), SHORT, scan)
+    assert_same_as_sums(rank_all(unruled(tiled), scan), tiled, scan)
 
 
 def test_the_best_of_all_tiles_come_first(tiled):
@@ -204,7 +211,7 @@ def test_what_the_shells_rule_out_is_not_listed(kind, request):
     _, allowed = lattice_over(l_room(), config.spacing, config.margin)
     left = left_by_shells(made, scan, allowed.shape)
     assert 0 < left.sum() < allowed.sum()
-    assert_same_as_sums(rank_all(made, scan), config, scan, left)
+    assert_same_as_sums(rank_all(made, scan), made, scan, left)
 
 
 @pytest.mark.parametrize("kind", ["true", "lonely"])
@@ -215,7 +222,10 @@ def test_nobody_stands_where_none_may(closed_grids, kind):
     assert not allowed.all()
     poses, scores = rank_all(unruled(made), SCANS[kind]())
     real = np.asarray(scores) > -2
-    assert real.sum() == HEADINGS // 2 * allowed.sum()
+    boxes = best_of_boxes(
+        np.zeros((HEADINGS, *allowed.shape)), allowed, made.tiles.core, *BOX
+    )
+    assert real.sum() == len(boxes)
     back = geometry.transform_points(geometry.inverse(lattice.frame), poses[:, :2])
     column, row = np.rint(np.asarray(back)[real] / CONFIG.spacing - 0.5).astype(int).T
     assert allowed[row, column].all()
@@ -234,13 +244,23 @@ def test_the_right_place_is_among_the_first(atlas):
         assert (near & (turned < 1.5 * 2 * np.pi / HEADINGS)).any()
 
 
-def test_of_two_headings_only_the_better_is_listed(atlas):
+def test_a_box_is_as_large_as_a_descent_reaches():
+    assert Box.of(0.8, 60) == (4, 1)
+    assert Box.of(0.4, 90) == (6, 2)
+    assert Box.of(2.0, 14) == (1, 1)
+    assert Box.of(0.5, 62) == (2, 2)  # 4 does not divide 62
+    assert (BOX, SHORT_BOX) == ((2, 2), (2, 3))
+    for box in (BOX, SHORT_BOX, Box(24, 16)):  # float32 tells scores up to 2 apart
+        assert 2 * box.ticks * box.headings * box.nodes**2 <= 2**24
+
+
+def test_of_the_poses_in_a_box_only_the_best_is_listed(atlas):
     scan = scan_from(l_room(), jnp.asarray([*CENTRE, 0.4], float))
     poses, scores = (a[:60] for a in rank_all(atlas, scan))
     node = (np.asarray(poses[:, :2]) - np.asarray(atlas.lattice.frame[:2])) / 0.5 - 0.5
     heading = np.rint((np.asarray(poses[:, 2]) + np.pi) * HEADINGS / (2 * np.pi))
-    pairs = np.column_stack([np.rint(node), heading % HEADINGS // 2])
-    assert len(np.unique(pairs, axis=0)) == len(pairs) == 60
+    boxes = np.column_stack([np.rint(node) // 2, heading % HEADINGS // 2])
+    assert len(np.unique(boxes, axis=0)) == len(boxes) == 60
     assert (np.diff(scores) <= 0).all()
     assert scores[0] <= 1
 
@@ -248,7 +268,8 @@ def test_of_two_headings_only_the_better_is_listed(atlas):
 def test_more_poses_than_there_are_come_last_and_score_as_none(atlas):
     scan = scan_from(l_room(), jnp.asarray([*CENTRE, 0.4], float))
     poses, scores = rank_all(atlas, scan)
-    assert len(poses) == len(scores) == HEADINGS // 2 * atlas.tiles.allowed.size
+    boxes = BOX.per_core(HEADINGS, atlas.tiles.core)
+    assert len(poses) == len(scores) == len(atlas.tiles.allowed) * np.prod(boxes)
     none = np.asarray(scores) == -2
     assert none[np.argmax(none) :].all()
     assert (np.asarray(scores)[~none] > -1.5).all()
@@ -256,13 +277,17 @@ def test_more_poses_than_there_are_come_last_and_score_as_none(atlas):
 
 
 def test_a_turned_map_is_searched_as_it_lies(closed_grids):
-    """Turned by two steps of heading and shifted, the list is turned and shifted."""
+    """Turned by two steps of heading and shifted, the list is turned and shifted.
+
+    Without the shells: many ranges from the lattice to a grid's walls are whole numbers
+    of them, and rounding decides in which they are.
+    """
     (flat, here), (_, there) = closed_grids
     np.testing.assert_array_equal(here.tiles.allowed, there.tiles.allowed)
     pose = jnp.asarray(free_poses(flat, 1, seed=4)[0], float)
     scan = scan_from(flat, pose)
-    poses, scores = (a[:10] for a in rank_all(here, scan))
-    moved, moved_scores = (a[:10] for a in rank_all(there, scan))
+    poses, scores = (a[:10] for a in rank_all(unruled(here), scan))
+    moved, moved_scores = (a[:10] for a in rank_all(unruled(there), scan))
     np.testing.assert_allclose(moved_scores, scores, atol=1e-4)
     best = geometry.compose(MOVE, poses[0])
     off = np.asarray(moved, float) - np.asarray(best)
@@ -282,7 +307,7 @@ def test_in_double_precision(tiled):
             made = build_atlas(l_room(), SHORT)
         found = rank_all(unruled(made), scan)
         assert found.score.dtype == np.float64
-        assert_same_as_sums(found, SHORT, scan, exact=0.51 * 2.0**-20)
+        assert_same_as_sums(found, made, scan, exact=0.51 / SHORT_BOX.ticks)
     np.testing.assert_array_equal(made.tiles.allowed, tiled.tiles.allowed)
 
 

@@ -13,7 +13,7 @@ import pytest
 from fsmsm_jax.localisation import stream
 from fsmsm_jax.localisation.atlas import ScanAtlas
 from fsmsm_jax.localisation.fleet import Fleet
-from fsmsm_jax.localisation.search import Candidates, Localisation
+from fsmsm_jax.localisation.settle import Candidates, Localisation
 from fsmsm_jax.localisation.stream import Query, localise_stream, together
 from fsmsm_jax.sensing import Scan
 

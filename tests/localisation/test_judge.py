@@ -183,7 +183,7 @@ def test_jit_and_vmap_change_nothing(exact):
     np.testing.assert_allclose(jnp.stack(eager), jnp.stack(jitted), atol=1e-5)
 
 
-WALL_RULES = (judge_module._ON_THE_WAY, judge_module._NEAR, judge_module._CLEAR_OF_WALL)
+WALL_RULES = (judge_module.ON_THE_WAY, judge_module._NEAR, judge_module.CLEAR_OF_WALL)
 
 walls_met = jax.jit(on_walls)
 

@@ -66,15 +66,29 @@ def score_map(field, ranges, bearings, heading, spacing, reach, rules):
     return score
 
 
-def best_of_pairs(scores, allowed):
-    """Best scores of each two headings at each allowed node, sorted, best first.
+def best_of_boxes(scores, allowed, core, headings, nodes):
+    """Best scores of boxes of poses, sorted, best first.
 
     Args:
-        scores: (headings, rows, columns).
-        allowed: (rows, columns).
+        scores: (all headings, rows, columns).
+        allowed: (rows, columns); boxes without any are left out.
+        core: rows and columns of a tile, whose corner is that of its first box.
+        headings: in a box.
+        nodes: rows and columns in a box; those at a tile's end may have fewer.
     """
-    best = np.maximum(scores[::2], scores[1::2])
-    return np.sort(best[:, allowed].ravel())[::-1]
+    starts = lambda side: [
+        (tile + box, tile + min(box + nodes, core))
+        for tile in range(0, side, core)
+        for box in range(0, core, nodes)
+    ]
+    best = []
+    for top, bottom in starts(allowed.shape[0]):
+        for left, right in starts(allowed.shape[1]):
+            some = allowed[top:bottom, left:right]
+            if some.any():
+                here = scores[:, top:bottom, left:right][:, some]
+                best += list(here.reshape(-1, headings * some.sum()).max(axis=1))
+    return np.sort(best)[::-1]
 
 
 def shell_counts(ranges, counted, width, number):

@@ -1,0 +1,182 @@
+"""From some thousand places to an answer: descend, judge, polish, drop duplicates.
+
+The lattice of the search is coarse, and its poses stand up to half a spacing and half a
+step of heading beside the truth. They all descend onto the walls with few rays; what
+fits best there descends again with more; distinct places are polished by their ranges
+on the exact derivative. At each step fewer candidates are left and more rays judge
+them. All counts are fixed (`SearchConfig`), so one compilation serves every scan of a
+sensor.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from fsmsm_jax import geometry
+from fsmsm_jax.alignment.fit import descend_end_points, fit_ranges, polish_ranges
+from fsmsm_jax.alignment.information import covariance
+from fsmsm_jax.localisation.judge import Evidence, explain, on_walls, trust
+from fsmsm_jax.sensing.lidar import Scan
+from fsmsm_jax.world.occupancy import OccupancyGrid
+from fsmsm_jax.world.polygons import PolygonMap
+
+__all__ = ["Candidates", "Localisation", "SearchConfig", "settle"]
+
+_OFF_WALLS = 0.5  # [nats a ray]: quarter to twice of it did as well on four recordings
+
+
+class SearchConfig(eqx.Module):
+    """How many candidates survive each step, and how many rays judge them."""
+
+    headings: int = eqx.field(static=True, default=60)
+    """Headings of the exhaustive search, an even number."""
+    ranked: int = eqx.field(static=True, default=3072)
+    """Lattice poses that descend with few rays."""
+    descended: int = eqx.field(static=True, default=384)
+    """Candidates that descend with more."""
+    polished: int = eqx.field(static=True, default=96)
+    """Distinct candidates polished by their ranges."""
+    reported: int = eqx.field(static=True, default=16)
+    """Distinct candidates in the answer."""
+    search_rays: int = eqx.field(static=True, default=180)
+    """Rays of the exhaustive search and of the polish."""
+    descent_rays: int = eqx.field(static=True, default=90)
+    """Rays of the second descent, twice as many as of the first."""
+
+    def __check_init__(self):
+        """Refuse what the search cannot work with."""
+        if self.headings < 6 or self.headings % 2:
+            raise ValueError(
+                f"headings must be an even number from 6 on, got {self.headings}"
+            )
+        if not 2 <= self.reported <= self.polished <= self.descended <= self.ranked:
+            raise ValueError(
+                "candidates dwindle: expected 2 ≤ reported ≤ polished ≤ descended "
+                f"≤ ranked, got {self.reported}, {self.polished}, {self.descended}, "
+                f"{self.ranked}"
+            )
+        if min(self.search_rays, self.descent_rays) < 8:
+            raise ValueError("search_rays and descent_rays must be at least 8")
+
+
+class Candidates(NamedTuple):
+    """Distinct places that the scan may come from, best first."""
+
+    poses: Float[Array, "candidates 3"]
+    """Poses of the lidar in the map [m, m, rad]."""
+    scores: Float[Array, "candidates"]
+    """Mean log-likelihood of a ray; higher is better, −inf marks a duplicate."""
+    caer_per_ray: Float[Array, "candidates"]
+    """Mean |real − virtual range| where sensor and map both see something [m]."""
+
+
+class Localisation(NamedTuple):
+    """What one scan says about where the lidar is."""
+
+    pose: Float[Array, "3"]
+    """Best pose of the lidar in the map [m, m, rad]."""
+    covariance: Float[Array, "3 3"]
+    """Its covariance, from the Fisher information of the ranges [m, m, rad]²."""
+    caer_per_ray: Float[Array, ""]
+    """Mean |real − virtual range| where sensor and map both see something [m]."""
+    explained: Float[Array, ""]
+    """Share of the valid rays that the map explains."""
+    confident: Bool[Array, ""]
+    """Whether the pose can be trusted: explained well, and no rival comes near."""
+    candidates: Candidates
+    """The best places; index 0 is `pose`, index 1 the runner-up."""
+
+
+def settle(
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    poses: Float[Array, "ranked 3"],
+    config: SearchConfig,
+) -> Localisation:
+    """From lattice poses to an answer.
+
+    Args:
+        world: the map.
+        scan: the real scan.
+        poses: where to begin [m, m, rad]; as many as there are, up to `ranked`.
+        config: how many survive each step.
+    """
+    few = scan.thin(config.descent_rays // 2)
+    ranking_scan = scan.thin(config.search_rays)
+    descent_scan = scan.thin(config.descent_rays)
+
+    scales = jnp.array([0.8, 0.5, 0.3])
+    descend = lambda pose: descend_end_points(world, few, pose, scales)
+    # Barriers keep XLA from computing poses and scores again for each of their readers.
+    poses = jax.lax.optimization_barrier(jax.vmap(descend)(poses))
+    score = jax.vmap(lambda pose: on_walls(world, few, pose))(poses)
+    score = jax.lax.optimization_barrier(score)
+    poses = poses[jax.lax.top_k(score, min(config.descended, len(poses)))[1]]
+
+    scales = jnp.array([0.3, 0.25, 0.2, 0.2])
+    descend = lambda pose: descend_end_points(world, descent_scan, pose, scales)
+    poses = jax.vmap(descend)(poses)
+    score, _ = _judge(world, descent_scan, poses)
+    poses = poses[_distinct(poses, score, config.polished, 0.25, 0.15)[0]]
+
+    scales = jnp.array([0.4, 0.25, 0.2])
+    polish = lambda pose: polish_ranges(world, ranking_scan, pose, scales)
+    poses, thickness = jax.vmap(polish)(poses)
+    score, _ = _judge(world, ranking_scan, poses, thickness)
+    poses = poses[_distinct(poses, score, config.reported, 0.3, 0.25)[0]]
+
+    scales = jnp.array([0.2, 0.15, 0.1])  # sharp: what is there decides
+    polish = lambda pose: polish_ranges(world, scan, pose, scales)
+    poses, thickness = jax.vmap(polish)(poses)
+    score, evidence = _judge(world, scan, poses, thickness)
+    order, score = _distinct(poses, score, config.reported, 0.3, 0.25)
+    poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
+    pose, thick = fit_ranges(world, scan, poses[0], 4, 0.1)  # all good rays count
+    poses = poses.at[0].set(pose)
+    spread = covariance(world, scan, pose, thick)
+    best = jax.tree.map(lambda a: a[0], evidence)
+    return Localisation(
+        pose=pose,
+        covariance=spread,
+        caer_per_ray=best.caer_per_ray,
+        explained=best.explained,
+        confident=trust(score, best, spread),
+        candidates=Candidates(poses, score, evidence.caer_per_ray),
+    )
+
+
+def _judge(world, scan, poses, thickness=None) -> tuple[Array, Evidence]:
+    """Scores to rank by, and the evidence of `explain`.
+
+    A score is the mean log-likelihood, less what is lost where rays end off walls or
+    lead through some: in equal corridors a grazing ray's range says little and its end
+    point still much.
+    """
+
+    def one(pose, thickness):
+        evidence = explain(world, scan, pose, thickness)
+        off = 1 - on_walls(world, scan, pose)
+        return evidence.score - _OFF_WALLS * off, evidence
+
+    thickness = jnp.zeros(len(poses)) if thickness is None else thickness
+    return jax.vmap(one)(poses, thickness)
+
+
+def _distinct(poses, score, count, distance, angle):
+    """Indices of the best poses, best first, and their scores.
+
+    Those closer to a better one than `distance` [m] and `angle` [rad] sink with
+    score −inf.
+    """
+    order = jnp.argsort(-score)
+    apart = poses[order][:, None] - poses[order][None]
+    close = (jnp.linalg.norm(apart[..., :2], axis=-1) < distance) & (
+        jnp.abs(geometry.wrap(apart[..., 2])) < angle
+    )
+    duplicate = jnp.any(close & jnp.tri(len(poses), k=-1, dtype=bool), axis=1)
+    score = jnp.where(duplicate, -jnp.inf, score[order])
+    kept = jnp.argsort(-score)[:count]
+    return order[kept], score[kept]
