@@ -12,6 +12,7 @@ points; without them only the made-up office and campus are measured. In order:
 - real honest splits: the map knows nothing of the visit that is localised;
 - simulated scans in big maps, beside the Cramér–Rao bound and CBGL's results;
 - `infinite-corridor`: a real campus of long equal corridors, 232 m × 198 m;
+- `pruning`: what is ruled out before the search, and whether the right place was;
 - `campus`: a made-up one of 100 000 m², and what it costs against smaller ones;
 - `off_map`: scans of one building on the map of another, never to be believed;
 - `atlas` (each in a process of its own), `batch` and `raycast`.
@@ -32,6 +33,7 @@ from pathlib import Path
 import jax
 from localisation.campus import campus
 from localisation.cost import batch, cold_atlas, raycast_throughput
+from localisation.pruning import pruning
 from localisation.sections import (
     infinite_corridor,
     off_map,
@@ -67,6 +69,7 @@ SECTIONS: dict[str, Callable[[Options], Iterator[Metric]]] = {
     "cbgl_warehouse": partial(simulated, "cbgl_warehouse", right=100),
     "basement_5cm": partial(simulated, "basement_5cm", right=98),
     "infinite-corridor": infinite_corridor,
+    "pruning": pruning,
     "campus": campus,
     "off_map": off_map,
     "atlas": cold_atlas,

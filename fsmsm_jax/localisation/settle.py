@@ -123,15 +123,11 @@ def settle(
     poses = poses[_distinct(poses, score, config.polished, 0.25, 0.15)[0]]
 
     scales = jnp.array([0.4, 0.25, 0.2])
-    polish = lambda pose: polish_ranges(world, ranking_scan, pose, scales)
-    poses, thickness = jax.vmap(polish)(poses)
-    score, _ = _judge(world, ranking_scan, poses, thickness)
+    poses, score, _ = _polish(world, ranking_scan, poses, scales)
     poses = poses[_distinct(poses, score, config.reported, 0.3, 0.25)[0]]
 
     scales = jnp.array([0.2, 0.15, 0.1])  # sharp: what is there decides
-    polish = lambda pose: polish_ranges(world, scan, pose, scales)
-    poses, thickness = jax.vmap(polish)(poses)
-    score, evidence = _judge(world, scan, poses, thickness)
+    poses, score, evidence = _polish(world, scan, poses, scales)
     order, score = _distinct(poses, score, config.reported, 0.3, 0.25)
     poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
     pose, thick = fit_ranges(world, scan, poses[0], 4, 0.1)  # all good rays count
@@ -146,6 +142,22 @@ def settle(
         confident=trust(score, best, spread),
         candidates=Candidates(poses, score, evidence.caer_per_ray),
     )
+
+
+def _polish(world, scan, poses, scales) -> tuple[Array, Array, Evidence]:
+    """Poses by their ranges, with score and evidence; as they were where that is worse.
+
+    Rays that graze walls pull many a good pose away.
+    """
+    polished, thickness = jax.vmap(lambda p: polish_ranges(world, scan, p, scales))(poses)
+    before = poses, *_judge(world, scan, poses)
+    after = polished, *_judge(world, scan, polished, thickness)
+    better = after[1] > before[1]
+
+    def choose(new, old):
+        return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, after, before)
 
 
 def _judge(world, scan, poses, thickness=None) -> tuple[Array, Evidence]:
