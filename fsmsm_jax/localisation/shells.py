@@ -14,7 +14,7 @@ both beside it, since the sensor stands up to half a lattice diagonal off the no
 
 Places that explain too little are dropped before anything is correlated. People and
 moved furniture lower E at the right place as well, so the limit sinks with the best E
-of the map. What that loses and saves are the rows `pruning` of `scripts/bench_localisation.py`.
+of the map. What that loses and saves: `scripts/bench_localisation.py --only pruning`.
 """
 
 import jax.numpy as jnp

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
+from localisation.rates import percent
 from localisation.sets import Options, ScanSet, atlas_of, office_set, real_set
 
 from fsmsm_jax.benchmark import Metric
@@ -34,16 +35,14 @@ def pruning(options: Options) -> Iterator[Metric]:
     for name in SPLITS:
         kept, left = _kept_and_left(real_set(name, options))
         everybody.append(kept)
-        yield Metric(f"pruning/{name}_kept", 100 * kept.mean(), "%", "higher")
-        yield Metric(
-            f"pruning/{name}_left", 100 * left.mean(), "% of positions", "lower"
-        )
+        yield Metric(f"pruning/{name}_kept", percent(kept), "%", "higher")
+        yield Metric(f"pruning/{name}_left", percent(left), "% of positions", "lower")
     kept = np.concatenate(everybody)
     yield Metric("pruning/real_scans", len(kept), "scans")
-    yield Metric("pruning/real_kept", 100 * kept.mean(), "%", "higher", RECALL)
+    yield Metric("pruning/real_kept", percent(kept), "%", "higher", RECALL)
     kept, left = _kept_and_left(office_set(options.limit or 1000))
-    yield Metric("pruning/office_kept", 100 * kept.mean(), "%", "higher")
-    yield Metric("pruning/office_left", 100 * left.mean(), "% of positions", "lower")
+    yield Metric("pruning/office_kept", percent(kept), "%", "higher")
+    yield Metric("pruning/office_left", percent(left), "% of positions", "lower")
 
 
 def _kept_and_left(cases: ScanSet) -> tuple[np.ndarray, np.ndarray]:

@@ -123,12 +123,13 @@ def test_nothing_valid_is_no_nan():
         assert np.isfinite(jnp.stack(found)).all()
 
 
-def sure(scores=(0.0, -5.0), covariance=CERTAIN, **best):
+def sure(scores=(0.0, -5.0), covariance=CERTAIN, score=None, **best):
     shares = {"explained": 1.0, "blocked": 0.0, "through": 0.0, **best}
     shares = {name: jnp.asarray(value, float) for name, value in shares.items()}
-    score = jnp.asarray(scores, float)
-    best = Evidence(score=score[0], caer_per_ray=jnp.zeros(()), **shares)
-    return bool(trust(score, best, covariance))
+    ranked = jnp.asarray(scores, float)
+    its = ranked[0] if score is None else jnp.asarray(score, float)
+    best = Evidence(score=its, caer_per_ray=jnp.zeros(()), **shares)
+    return bool(trust(ranked, best, covariance))
 
 
 def test_people_in_the_way_are_forgiven_in_part():
@@ -136,6 +137,13 @@ def test_people_in_the_way_are_forgiven_in_part():
     scores = (-0.5, -0.9)
     assert not sure(scores=scores)
     assert sure(scores=scores, blocked=0.3)
+
+
+def test_doubt_is_what_the_map_does_not_explain():
+    """Whatever else the ranking takes off the scores."""
+    scores = (-0.5, -0.9)
+    assert sure(scores=scores, score=-0.2)
+    assert not sure(scores=scores, score=-0.5)
 
 
 def test_rays_through_walls_are_not_forgiven():
