@@ -56,11 +56,6 @@ class Tiles(eqx.Module):
         """Nodes along a core."""
         return self.allowed.shape[-1]
 
-    @property
-    def rim(self) -> int:
-        """Nodes from the edge of a tile to its core."""
-        return (self.side - self.core) // 2
-
 
 def spread(arrays: Sequence[Array | np.ndarray], mesh: Mesh) -> Tiles:
     """Tiles shared out over the devices of a mesh, as evenly as they go.
