@@ -113,7 +113,10 @@ def explain(
 
 
 def on_walls(
-    world: OccupancyGrid | PolygonMap, scan: Scan, pose: Float[Array, "3"]
+    world: OccupancyGrid | PolygonMap,
+    scan: Scan,
+    pose: Float[Array, "3"],
+    probes: tuple[float, ...] = ON_THE_WAY,
 ) -> Float[Array, ""]:
     """A first judgement, without casting: do rays end on walls, and on none before?
 
@@ -121,6 +124,7 @@ def on_walls(
         world: the map.
         scan: the real scan.
         pose: where the lidar may have been [m, m, rad].
+        probes: where on a ray's way walls are looked for, in shares of it.
 
     Returns:
         At most 1: the weight of the echoes that end on walls, less half that of rays
@@ -134,9 +138,9 @@ def on_walls(
         -0.5 * (world.distance_at(pose[None, :2] + share * along) / _NEAR) ** 2
     )
     score = jnp.where(scan.echo, near(1.0), 0.0)
-    for share in ON_THE_WAY:
+    for share in probes:
         clear = scan.valid & ((1 - share) * scan.ranges > CLEAR_OF_WALL)
-        score -= jnp.where(clear, IN_THE_WAY / len(ON_THE_WAY) * near(share), 0.0)
+        score -= jnp.where(clear, IN_THE_WAY / len(probes) * near(share), 0.0)
     return jnp.sum(say * score)
 
 

@@ -18,7 +18,13 @@ from jaxtyping import Array, Bool, Float
 from fsmsm_jax import geometry
 from fsmsm_jax.alignment.fit import descend_end_points, fit_ranges, polish_ranges
 from fsmsm_jax.alignment.information import covariance
-from fsmsm_jax.localisation.judge import Evidence, explain, on_walls, trust
+from fsmsm_jax.localisation.judge import (
+    ON_THE_WAY,
+    Evidence,
+    explain,
+    on_walls,
+    trust,
+)
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
@@ -26,6 +32,7 @@ from fsmsm_jax.world.polygons import PolygonMap
 __all__ = ["Candidates", "Localisation", "SearchConfig", "settle"]
 
 _ASTRAY = 0.1  # [nats a ray] that a polish may cost; those that stray cost twice that
+_FIRST = 8  # places that all rays polish again; the others stay as fewer left them
 _OFF_WALLS = 0.5  # [nats a ray]: quarter to twice of it did as well on four recordings
 
 
@@ -40,7 +47,7 @@ class SearchConfig(eqx.Module):
     """Candidates that descend with more."""
     polished: int = eqx.field(static=True, default=96)
     """Distinct candidates polished by their ranges."""
-    reported: int = eqx.field(static=True, default=16)
+    reported: int = eqx.field(static=True, default=32)
     """Distinct candidates in the answer."""
     search_rays: int = eqx.field(static=True, default=180)
     """Rays of the exhaustive search and of the polish."""
@@ -105,17 +112,14 @@ def settle(
         poses: where to begin [m, m, rad]; as many as there are, up to `ranked`.
         config: how many survive each step.
     """
-    few = scan.thin(config.descent_rays // 2)
     ranking_scan = scan.thin(config.search_rays)
     descent_scan = scan.thin(config.descent_rays)
 
-    scales = jnp.array([0.8, 0.5, 0.3])
-    descend = lambda pose: descend_end_points(world, few, pose, scales)
-    # Barriers keep XLA from computing poses and scores again for each of their readers.
-    poses = jax.lax.optimization_barrier(jax.vmap(descend)(poses))
-    score = jax.vmap(lambda pose: on_walls(world, few, pose))(poses)
-    score = jax.lax.optimization_barrier(score)
-    poses = poses[jax.lax.top_k(score, min(config.descended, len(poses)))[1]]
+    # Two steps show which half is hopeless; the others take two more.
+    few = scan.thin(config.descent_rays // 2)
+    promising = max(config.descended, len(poses) // 2)
+    poses = _descend(world, few, poses, [0.8, 0.5], promising, ON_THE_WAY[1:2])
+    poses = _descend(world, few, poses, [0.4, 0.3], config.descended, ON_THE_WAY)
 
     scales = jnp.array([0.3, 0.25, 0.2, 0.2])
     descend = lambda pose: descend_end_points(world, descent_scan, pose, scales)
@@ -124,13 +128,14 @@ def settle(
     poses = poses[_distinct(poses, score, config.polished, 0.25, 0.15)[0]]
 
     scales = jnp.array([0.4, 0.25, 0.2])
-    poses, score, _ = _polish(world, ranking_scan, poses, scales)
-    poses = poses[_distinct(poses, score, config.reported, 0.3, 0.25)[0]]
+    found = _polish(world, ranking_scan, poses, scales)
+    found = _distinct_of(found, config.reported)
 
     scales = jnp.array([0.2, 0.15, 0.1])  # sharp: what is there decides
-    poses, score, evidence = _polish(world, scan, poses, scales)
-    order, score = _distinct(poses, score, config.reported, 0.3, 0.25)
-    poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
+    first = _polish(world, scan, found[0][:_FIRST], scales)
+    join = lambda new, old: jnp.concatenate([new, old[_FIRST:]])
+    found = jax.tree.map(join, first, found)
+    poses, score, evidence = _distinct_of(found, config.reported)
     pose, thick = fit_ranges(world, scan, poses[0], 4, 0.1)  # all good rays count
     poses = poses.at[0].set(pose)
     spread = covariance(world, scan, pose, thick)
@@ -143,6 +148,16 @@ def settle(
         confident=trust(score, best, spread),
         candidates=Candidates(poses, score, evidence.caer_per_ray),
     )
+
+
+def _descend(world, scan, poses, scales, count, probes):
+    """Down onto the walls; those that are then on them best, by `on_walls`."""
+    one = lambda pose: descend_end_points(world, scan, pose, jnp.array(scales))
+    # Barriers keep XLA from computing poses and scores again for each of their readers.
+    poses = jax.lax.optimization_barrier(jax.vmap(one)(poses))
+    score = jax.vmap(lambda pose: on_walls(world, scan, pose, probes))(poses)
+    score = jax.lax.optimization_barrier(score)
+    return poses[jax.lax.top_k(score, min(count, len(poses)))[1]]
 
 
 def _polish(world, scan, poses, scales) -> tuple[Array, Array, Evidence]:
@@ -177,6 +192,14 @@ def _judge(world, scan, poses, thickness=None) -> tuple[Array, Evidence]:
 
     thickness = jnp.zeros(len(poses)) if thickness is None else thickness
     return jax.vmap(one)(poses, thickness)
+
+
+def _distinct_of(found, count):
+    """The best of poses, scores and evidence, best first."""
+    poses, score, evidence = found
+    order, score = _distinct(poses, score, count, 0.3, 0.25)
+    poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
+    return poses, score, evidence
 
 
 def _distinct(poses, score, count, distance, angle):
