@@ -57,13 +57,14 @@ def descend_end_points(
     Returns:
         The refined pose of the lidar in the map.
     """
-
-    def distances(pose):
-        return world.distance_at(geometry.transform_points(pose, scan.points))
+    distances = jax.vmap(jax.value_and_grad(world.distance_at))
 
     def step(pose, scale):
-        e, derivative = jax.linearize(distances, pose)
-        J = jax.vmap(derivative, out_axes=1)(jnp.eye(3, dtype=pose.dtype))
+        end = geometry.transform_points(pose, scan.points)
+        e, slope = distances(end)
+        lever = end - pose[None, :2]
+        turn = slope[:, 1] * lever[:, 0] - slope[:, 0] * lever[:, 1]
+        J = jnp.concatenate([slope, turn[:, None]], axis=1)
         w = jnp.where(scan.echo, geman_mcclure(e, scale), 0.0)
         return gauss_newton_step(pose, -e, J, w, _DAMPING), None
 

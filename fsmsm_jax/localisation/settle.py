@@ -124,18 +124,17 @@ def settle(
     scales = jnp.array([0.3, 0.25, 0.2, 0.2])
     descend = lambda pose: descend_end_points(world, descent_scan, pose, scales)
     poses = jax.vmap(descend)(poses)
-    score, _ = _judge(world, descent_scan, poses)
-    poses = poses[_distinct(poses, score, config.polished, 0.25, 0.15)[0]]
+    found = poses, *_judge(world, descent_scan, poses)
+    found = _distinct(found, config.polished, 0.25, 0.15)
 
-    scales = jnp.array([0.4, 0.25, 0.2])
-    found = _polish(world, ranking_scan, poses, scales)
-    found = _distinct_of(found, config.reported)
+    found = _polish(world, ranking_scan, found, [0.4, 0.25, 0.2])
+    found = _distinct(found, config.reported, 0.3, 0.25)
 
-    scales = jnp.array([0.2, 0.15, 0.1])  # sharp: what is there decides
-    first = _polish(world, scan, found[0][:_FIRST], scales)
+    first = jax.tree.map(lambda a: a[:_FIRST], found)
+    first = _polish(world, scan, first, [0.2, 0.15, 0.1])  # sharp: all is there
     join = lambda new, old: jnp.concatenate([new, old[_FIRST:]])
     found = jax.tree.map(join, first, found)
-    poses, score, evidence = _distinct_of(found, config.reported)
+    poses, score, evidence = _distinct(found, config.reported, 0.3, 0.25)
     pose, thick = fit_ranges(world, scan, poses[0], 4, 0.1)  # all good rays count
     poses = poses.at[0].set(pose)
     spread = covariance(world, scan, pose, thick)
@@ -160,21 +159,21 @@ def _descend(world, scan, poses, scales, count, probes):
     return poses[jax.lax.top_k(score, min(count, len(poses)))[1]]
 
 
-def _polish(world, scan, poses, scales) -> tuple[Array, Array, Evidence]:
-    """Poses by their ranges, with score and evidence; as they were if that went astray.
+def _polish(world, scan, found, scales) -> tuple[Array, Array, Evidence]:
+    """Poses by their ranges, judged anew; as they were found if that went astray.
 
     Rays that graze walls pull many a good pose away. A little worse is no sign of it.
     """
-    polish = lambda pose: polish_ranges(world, scan, pose, scales)
+    poses, score, _ = found
+    polish = lambda pose: polish_ranges(world, scan, pose, jnp.array(scales))
     polished, thickness = jax.vmap(polish)(poses)
-    before = poses, *_judge(world, scan, poses)
     after = polished, *_judge(world, scan, polished, thickness)
-    sound = after[1] > before[1] - _ASTRAY
+    sound = after[1] > score - _ASTRAY
 
     def choose(new, old):
         return jnp.where(sound.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-    return jax.tree.map(choose, after, before)
+    return jax.tree.map(choose, after, found)
 
 
 def _judge(world, scan, poses, thickness=None) -> tuple[Array, Evidence]:
@@ -194,20 +193,13 @@ def _judge(world, scan, poses, thickness=None) -> tuple[Array, Evidence]:
     return jax.vmap(one)(poses, thickness)
 
 
-def _distinct_of(found, count):
-    """The best of poses, scores and evidence, best first."""
-    poses, score, evidence = found
-    order, score = _distinct(poses, score, count, 0.3, 0.25)
-    poses, evidence = jax.tree.map(lambda a: a[order], (poses, evidence))
-    return poses, score, evidence
-
-
-def _distinct(poses, score, count, distance, angle):
-    """Indices of the best poses, best first, and their scores.
+def _distinct(found, count, distance, angle):
+    """The best of poses, scores and evidence, best first.
 
     Those closer to a better one than `distance` [m] and `angle` [rad] sink with
     score −inf.
     """
+    poses, score, evidence = found
     order = jnp.argsort(-score)
     apart = poses[order][:, None] - poses[order][None]
     close = (jnp.linalg.norm(apart[..., :2], axis=-1) < distance) & (
@@ -216,4 +208,5 @@ def _distinct(poses, score, count, distance, angle):
     duplicate = jnp.any(close & jnp.tri(len(poses), k=-1, dtype=bool), axis=1)
     score = jnp.where(duplicate, -jnp.inf, score[order])
     kept = jnp.argsort(-score)[:count]
-    return order[kept], score[kept]
+    poses, evidence = jax.tree.map(lambda a: a[order[kept]], (poses, evidence))
+    return poses, score[kept], evidence
