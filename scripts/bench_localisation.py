@@ -14,6 +14,7 @@ points; without them only the made-up office and campus are measured. In order:
 - `infinite-corridor`: a real campus of long equal corridors, 232 m × 198 m;
 - `pruning`: what is ruled out before the search, and whether the right place was;
 - `campus`: a made-up one of 100 000 m², and what it costs against smaller ones;
+- `devices`: a query by eight devices of this machine against one by one of them;
 - `off_map`: scans of one building on the map of another, never to be believed;
 - `atlas` (each in a process of its own), `batch` and `raycast`.
 
@@ -33,6 +34,7 @@ from pathlib import Path
 import jax
 from localisation.campus import campus
 from localisation.cost import batch, cold_atlas, raycast_throughput
+from localisation.devices import devices
 from localisation.pruning import pruning
 from localisation.sections import (
     infinite_corridor,
@@ -71,6 +73,7 @@ SECTIONS: dict[str, Callable[[Options], Iterator[Metric]]] = {
     "infinite-corridor": infinite_corridor,
     "pruning": pruning,
     "campus": campus,
+    "devices": devices,
     "off_map": off_map,
     "atlas": cold_atlas,
     "batch": batch,

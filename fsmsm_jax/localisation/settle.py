@@ -1,11 +1,11 @@
 """From some thousand places to an answer: descend, judge, polish, drop duplicates.
 
 The lattice of the search is coarse, and its poses stand up to half a spacing and half a
-step of heading beside the truth. They all descend onto the walls with few rays; what
-fits best there descends again with more; distinct places are polished by their ranges
-on the exact derivative. At each step fewer candidates are left and more rays judge
-them. All counts are fixed (`SearchConfig`), so one compilation serves every scan of a
-sensor.
+step of heading beside the truth. They all descend onto the walls with few rays, the
+better half of them farther; what fits best there descends again with more; distinct
+places are polished by their ranges on the exact derivative. At each step fewer
+candidates are left and more rays judge them. All counts are fixed (`SearchConfig`), so
+one compilation serves every scan of a sensor.
 """
 
 from typing import NamedTuple
