@@ -127,7 +127,7 @@ def settle(
     found = poses, *_judge(world, descent_scan, poses)
     found = _distinct(found, config.polished, 0.25, 0.15)
 
-    found = _polish(world, ranking_scan, found, [0.4, 0.25, 0.2])
+    found = _polish(world, ranking_scan, found, [0.4, 0.2])
     found = _distinct(found, config.reported, 0.3, 0.25)
 
     first = jax.tree.map(lambda a: a[:_FIRST], found)
