@@ -33,7 +33,7 @@ __all__ = ["Candidates", "Localisation", "SearchConfig", "settle"]
 
 _ASTRAY = 0.1  # [nats a ray] that a polish may cost; those that stray cost twice that
 _FIRST = 8  # places that all rays polish again; the others stay as fewer left them
-_OFF_WALLS = 0.5  # [nats a ray]: quarter to twice of it did as well on four recordings
+_OFF_WALLS = 1.0  # [nats a ray]: half of it cost 1 % of infinite-corridor, else a scan
 
 
 class SearchConfig(eqx.Module):
