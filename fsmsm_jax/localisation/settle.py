@@ -33,7 +33,9 @@ __all__ = ["Candidates", "Localisation", "SearchConfig", "settle"]
 
 _ASTRAY = 0.1  # [nats a ray] that a polish may cost; those that stray cost twice that
 _FIRST = 8  # places that all rays polish again; the others stay as fewer left them
-_OFF_WALLS = 1.0  # [nats a ray]: half of it cost 1 % of infinite-corridor, else a scan
+# [nats a ray]. Half of it found 11 of 970 scans fewer in long corridors, 4 of 1 242 and
+# one of 208 more in offices.
+_OFF_WALLS = 1.0
 
 
 class SearchConfig(eqx.Module):
