@@ -78,7 +78,9 @@ class Candidates(NamedTuple):
     poses: Float[Array, "candidates 3"]
     """Poses of the lidar in the map [m, m, rad]."""
     scores: Float[Array, "candidates"]
-    """Mean log-likelihood of a ray; higher is better, −inf marks a duplicate."""
+    """Mean log-likelihood of a ray, less what rays lose that end off walls; higher is
+    better, −inf marks a duplicate. The first few are by all rays, the others by
+    `search_rays` of them."""
     caer_per_ray: Float[Array, "candidates"]
     """Mean |real − virtual range| where sensor and map both see something [m]."""
 
