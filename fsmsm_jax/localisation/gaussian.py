@@ -4,6 +4,7 @@ The two lines of a Kalman filter, on planar poses. Covariances are in the map fr
 [m, m, rad]², headings are linearised about the mean; a degree or ten bear that.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -39,7 +40,7 @@ def mean(
     a: Float[Array, "3"],
     P: Float[Array, "3 3"],
     b: Float[Array, "3"],
-    R: Float[Array, "3 3"],
+    L: Float[Array, "3 3"],
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, ""]]:
     """Weighted mean of two independent poses.
 
@@ -47,23 +48,26 @@ def mean(
         a: one pose [m, m, rad].
         P: its covariance.
         b: the other.
-        R: its covariance.
+        L: lower triangular root of its covariance, L Lᵀ (`covariance_root`).
 
     Returns:
         The mean, its covariance, and the squared Mahalanobis distance of the two.
 
     Note:
-        P + R is scaled to ones on its diagonal, and the covariance written as a sum of
-        squares (P. Joseph's form): float32 then bears 10 m beside a millimetre.
+        A square-root filter: a + C u with C Cᵀ = P, where u is small, and L⁻¹ C u near
+        L⁻¹ (b − a), all with unit variance; least squares by QR. L Lᵀ is never formed:
+        float32 then bears 10 m beside a millimetre, along any axes.
+
+    Reference:
+        G. Bierman, "Factorization Methods for Discrete Sequential Estimation", 1977.
     """
     away = b - a
     away = away.at[2].set(geometry.wrap(away[2]))
-    scale = jnp.sqrt(jnp.diagonal(P + R))
-    S = (P + R) / (scale[:, None] * scale[None])
-    K = jnp.linalg.solve(S, P / scale[:, None]).T / scale[None]
-    rest = jnp.eye(3, dtype=P.dtype) - K
-    pose = a + K @ away
-    covariance = rest @ P @ rest.T + K @ R @ K.T
-    distance = (away / scale) @ jnp.linalg.solve(S, away / scale)
-    covariance = definite(0.5 * (covariance + covariance.T))
-    return pose.at[2].set(geometry.wrap(pose[2])), covariance, distance
+    C = jnp.linalg.cholesky(definite(P))
+    seen = jnp.concatenate([C, away[:, None]], axis=1)
+    seen = jax.scipy.linalg.solve_triangular(L, seen, lower=True)
+    expected = jnp.eye(3, 4, dtype=P.dtype)
+    R = jnp.linalg.qr(jnp.concatenate([expected, seen]), mode="r")
+    W = jax.scipy.linalg.solve_triangular(R[:3, :3], C.T, trans=1).T
+    pose = a + W @ R[:3, 3]
+    return pose.at[2].set(geometry.wrap(pose[2])), definite(W @ W.T), R[3, 3] ** 2

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, ScalarLike
 
 from fsmsm_jax import geometry
-from fsmsm_jax.alignment.information import covariance as covariance_of
+from fsmsm_jax.alignment.information import covariance_root, definite
 from fsmsm_jax.localisation.correction import CorrectionConfig, correct
 from fsmsm_jax.localisation.gaussian import mean, moved
 from fsmsm_jax.localisation.judge import explain
@@ -182,17 +182,18 @@ def step(
         usual=state.deviation,
         config=config.correction,
     )
-    spread_measured = covariance_of(world, scan, measured, thickness)
+    root = covariance_root(world, scan, measured, thickness)
 
     # Three opinions, the mean of the two among them, and what each makes of the scan.
-    fused, spread_fused, distance = mean(predicted, expected, measured, spread_measured)
+    fused, spread_fused, distance = mean(predicted, expected, measured, root)
     poses = jnp.stack([fused, measured, predicted])
     evidence = jax.vmap(lambda pose: explain(world, scan, pose, thickness))(poses)
     choice = _choose(evidence.score, distance, config)
     informative = jnp.sum(scan.echo) >= config.fewest
     choice = jnp.where(informative, choice, _PREDICTED)
     pose = poses[choice]
-    covariance = jnp.stack([spread_fused, spread_measured, expected])[choice]
+    spreads = jnp.stack([spread_fused, definite(root @ root.T), expected])
+    covariance = spreads[choice]
     evidence = jax.tree.map(lambda a: a[choice], evidence)
 
     corrected = choice != _PREDICTED
