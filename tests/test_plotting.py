@@ -43,7 +43,7 @@ def scene(world, pose, confident=True):
         caer_per_ray=caer[0],
         explained=jnp.asarray(0.9),
         confident=jnp.asarray(confident),
-        candidates=Candidates(poses, -caer, caer),
+        candidates=Candidates(poses, -caer, -caer, caer),
     )
 
 

@@ -134,8 +134,8 @@ def _candidates(result: Localisation) -> list[dict]:
     """The distinct places, best first; duplicates, of score −inf, are left out."""
     rows = zip(*(np.asarray(a).tolist() for a in result.candidates), strict=True)
     return [
-        {"pose": pose, "score": score, "caer_per_ray": caer}
-        for pose, score, caer in rows
+        {"pose": pose, "score": score, "likelihood": likelihood, "caer_per_ray": caer}
+        for pose, score, likelihood, caer in rows
         if np.isfinite(score)
     ]
 

@@ -52,10 +52,10 @@ def begun(
         odometry: what it read at that scan [m, m, rad], if it did.
         incumbent: the tracker until now, and the total that it begins with.
     """
-    scores = np.asarray(candidates.scores)
-    distinct = np.flatnonzero(np.isfinite(scores))
+    likelihood = np.asarray(candidates.likelihood)
+    distinct = np.flatnonzero(np.isfinite(candidates.scores))
     start = lambda pose: tracker.init(world, pose, None, odometry)
-    states, totals = jax.vmap(start)(candidates.poses[distinct]), scores[distinct]
+    states, totals = jax.vmap(start)(candidates.poses[distinct]), likelihood[distinct]
     if incumbent is not None:
         state, total = incumbent
         join = lambda one, all: jnp.concatenate([one[None], all])

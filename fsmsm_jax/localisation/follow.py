@@ -161,7 +161,7 @@ def _track(atlas, state, reading, config):
         return state._replace(score=usual, doubt=doubt), _fix(info, "doubted")
     # What the tracked place fell short of in earlier scans counts against it as well.
     total = float(state.score - config.tracker.slack - info.doubt)
-    if found.candidates.scores[0] - total > config.overthrow:
+    if found.candidates.likelihood[0] - total > config.overthrow:
         return _answer(atlas.world, found, reading.odometry)
     contest = begun(atlas.world, found.candidates, reading.odometry, (state, total))
     return contest, _fix(info, "doubted")
@@ -169,7 +169,7 @@ def _track(atlas, state, reading, config):
 
 def _better(found, state, info, config):
     """Whether another place explains the scan clearly better, and as well as usual."""
-    score = found.candidates.scores[0]
+    score = found.candidates.likelihood[0]
     as_usual = score > state.score - config.tracker.slack
     explains = 1 - found.explained < config.still_open * (1 - info.explained)
     return (score > info.score + config.better) & as_usual & explains

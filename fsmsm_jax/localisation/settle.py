@@ -81,6 +81,8 @@ class Candidates(NamedTuple):
     """Mean log-likelihood of a ray, less what rays lose that end off walls; higher is
     better, −inf marks a duplicate. The first few are by all rays, the others by
     `search_rays` of them."""
+    likelihood: Float[Array, "candidates"]
+    """Mean log-likelihood of a ray (`judge.explain`), which the tracker goes by."""
     caer_per_ray: Float[Array, "candidates"]
     """Mean |real − virtual range| where sensor and map both see something [m]."""
 
@@ -149,7 +151,7 @@ def settle(
         caer_per_ray=best.caer_per_ray,
         explained=best.explained,
         confident=trust(score, best, spread),
-        candidates=Candidates(poses, score, evidence.caer_per_ray),
+        candidates=Candidates(poses, score, evidence.score, evidence.caer_per_ray),
     )
 
 

@@ -76,7 +76,7 @@ def ask_atlas(atlas: ScanAtlas, scans: Sequence[Scan], name: str) -> Answers:
         times.append(time.perf_counter() - start)
         poses.append(np.asarray(result.pose))
         confident.append(bool(result.confident))
-        places, scores, _ = map(np.asarray, result.candidates)
+        places, scores = map(np.asarray, result.candidates[:2])
         candidates.append(np.where(np.isfinite(scores)[:, None], places, np.nan))
     told = np.stack(poses), np.array(confident), np.array(times), first
     return Answers(*told, np.stack(candidates))

@@ -113,7 +113,7 @@ def test_a_query_answers_as_the_search_does(tmp_path, monkeypatch):
     def quick(atlas, scan, config):
         score = atlas.lattice.frame.sum() + scan.ranges[: config.reported]
         poses = jnp.outer(score, jnp.arange(3.0))
-        candidates = Candidates(poses, score, -score)
+        candidates = Candidates(poses, score, 2 * score, -score)
         spread = jnp.diag(poses[1])
         return Localisation(
             poses[0], spread, score[0], score[1], score[0] > 0, candidates

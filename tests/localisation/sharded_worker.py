@@ -54,7 +54,7 @@ def one_by_one(atlas: ScanAtlas, scans: Scan):
 
 
 def write(folder: Path, name: str, found) -> None:
-    poses, scores, _ = found.candidates
+    poses, scores = found.candidates[:2]
     sure = found.confident
     np.savez(folder / f"{name}.npz", poses=poses, scores=scores, confident=sure)
 

@@ -53,7 +53,7 @@ class Engine:
         pose = np.stack([numbers, scans.range_max, 0 * numbers], axis=-1)
         nought = np.zeros(len(numbers))
         spread = np.zeros((len(numbers), 3, 3))
-        places = Candidates(pose[:, None], nought[:, None], nought[:, None])
+        places = Candidates(pose[:, None], *[nought[:, None]] * 3)
         return Localisation(pose, spread, nought, nought, nought > 0, places)
 
 
