@@ -47,7 +47,8 @@ class CorrectionConfig(eqx.Module):
     least: tuple[ScalarLike, ScalarLike] = (0.15, 0.04)
     """Standard deviation that the prediction has at least, for the starts [m, rad]."""
     blur: ScalarLike = 0.15
-    """Standard deviation of an end point about its wall, when starts compete [m]."""
+    """Standard deviation of an end point about its wall, when starts compete [m]; more
+    where scans usually deviate more: a map that is wrong by decimetres tells less."""
     voices: ScalarLike = 30.0
     """Independent rays that a scan's likelihood counts for."""
     slip: ScalarLike = 4.0
@@ -76,7 +77,7 @@ def correct(
         covariance: of the prediction [m, m, rad]².
         others: further places to start from; none of them counts as expected.
         usual: by how much scans deviate from this map (`deviation`) [m]; NaN if that
-            is not known yet: then this scan's own deviation counts.
+            is not known yet: then this scan's own deviation decides of the finish.
         config: settings.
 
     Returns:
@@ -94,7 +95,8 @@ def correct(
     scales = jnp.asarray(config.scales, sigma.dtype)
     descend = lambda pose: descend_end_points(world, few, pose, scales)
     poses = jax.vmap(descend)(starts)
-    witness = jax.vmap(lambda pose: _likelihood(world, few, pose, config.blur))(poses)
+    blur = jnp.fmax(config.blur, usual)
+    witness = jax.vmap(lambda pose: _likelihood(world, few, pose, blur))(poses)
     certainty = jnp.linalg.inv(covariance)
     prior = jax.vmap(lambda pose: _motion_cost(pose, predicted, certainty, config.slip))
     chosen = poses[jnp.argmax(config.voices * witness - prior(poses))]
