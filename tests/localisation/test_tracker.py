@@ -11,8 +11,11 @@ import pytest
 
 from fsmsm_jax import geometry
 from fsmsm_jax.evaluation.drives import drive, plan, record
+from fsmsm_jax.io import read_scans
 from fsmsm_jax.localisation import OdometryModel, TrackerConfig, tracker
 from fsmsm_jax.sensing import Lidar, Scan
+from fsmsm_jax.sensing.buckets import padded
+from fsmsm_jax.world import load_map
 from tests.localisation.simulated import (
     ENDS,
     LIDAR,
@@ -258,3 +261,22 @@ def test_a_kidnapped_robot_says_so(office, log, walked, seed):
             seen.append(bool(info.lost))
         lost.append(any(seen))
     assert np.mean(lost) >= 0.9
+
+
+@pytest.mark.parametrize("name", ["cmu_wean_log1", "cmu_wean_log2"])
+def test_a_map_that_is_wrong_by_decimetres(data, name):
+    """Furnished since, and crooked: the way is known to half a metre, and no jumps.
+
+    The reference is a pseudo ground truth, up to a metre from where we go (README).
+    """
+    world = load_map(data / "real" / "cmu_wean.yaml")
+    log = read_scans(data / "real" / f"{name}.npz")
+    reference = np.load(data / "real" / f"{name}.npz")["pseudo_gt_laser"]
+    state = tracker.init(world, jnp.asarray(reference[0], float))
+    # As `follow` hands them over: float32 keeps millimetres near nought only.
+    counted = log.odometry - log.odometry[0] * [1.0, 1.0, 0.0]
+    scans = padded(log.scans())
+    _, info = tracker.run(world, state, scans, jnp.asarray(counted, float))
+    away = error(info.pose, reference)[0]
+    assert away.max() < 2.0
+    assert np.median(away) < 0.25
