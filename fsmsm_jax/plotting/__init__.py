@@ -1,7 +1,7 @@
 """Pictures: each function draws one thing on an Axes that you bring, and returns it.
 
-`localisation` shows one answer on its map, `scans` the space that one scan saw;
-`thesis` shows what many answers are worth: the figures of the published evaluation,
+`world` draws the map, and `localisation` one answer on it; `scans` the space that one
+scan saw; `thesis` what many answers are worth: the figures of the published evaluation,
 with the published numbers on them; `basins` from how far off a matcher still finds
 home; `tracking` the way of a robot, `odometry` the way that scans alone tell,
 `slam` a map of landmarks.
@@ -9,19 +9,21 @@ home; `tracking` the way of a robot, `odometry` the way that scans alone tell,
 Import this package by its name; `import fsmsm_jax` alone does not load matplotlib.
 """
 
-from fsmsm_jax.plotting.localisation import (
+from fsmsm_jax.plotting.colours import (
     POSE as POSE,
     RIVAL as RIVAL,
     SCAN as SCAN,
     TRUTH as TRUTH,
     UNKNOWN as UNKNOWN,
     WALL as WALL,
+)
+from fsmsm_jax.plotting.localisation import (
     plot_covariance as plot_covariance,
     plot_localisation as plot_localisation,
     plot_pose as plot_pose,
     plot_scan as plot_scan,
-    plot_world as plot_world,
 )
+from fsmsm_jax.plotting.world import plot_world as plot_world
 from fsmsm_jax.plotting.scans import (
     SeenSpaceArtists as SeenSpaceArtists,
     plot_seen_space as plot_seen_space,

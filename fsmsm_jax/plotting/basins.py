@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.contour import QuadContourSet
 
-from fsmsm_jax.plotting.localisation import INK
+from fsmsm_jax.plotting.colours import INK
 
 __all__ = ["plot_basin"]
 

@@ -7,13 +7,10 @@ that answers "where am I?" on three scales: the building, the room, and the cent
 of the covariance ellipse.
 """
 
-import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
-from matplotlib.colors import to_rgb
-from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Ellipse, Rectangle
@@ -22,8 +19,16 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.transforms import Affine2D
 
-from fsmsm_jax.geometry import transform_points
 from fsmsm_jax.localisation.settle import Localisation
+from fsmsm_jax.plotting.colours import (
+    DOUBT,
+    INK,
+    POSE,
+    RIVAL,
+    SCAN,
+    TRUTH,
+)
+from fsmsm_jax.plotting.world import plot_world
 from fsmsm_jax.sensing.lidar import Scan
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
@@ -33,51 +38,16 @@ __all__ = [
     "plot_localisation",
     "plot_pose",
     "plot_scan",
-    "plot_world",
 ]
 
-WALL, UNKNOWN = "#2e3440", "#e9e7e1"
-SCAN, POSE, RIVAL, TRUTH = "#e4572e", "#1d4e89", "#8a6fb3", "#2a9d5c"
-INK, DOUBT = "#333333", "#b3541e"
 _ARROWHEAD = Path(
     [(1, 0), (-0.8, 0.65), (-0.45, 0), (-0.8, -0.65), (1, 0)], closed=True
 )
 _HALO = [withStroke(linewidth=2.5, foreground="white")]
-_MARGIN = 0.5  # [m] around the free space of a map
+_NEAR = 0.5  # [m]: a truth nearer than this is shown with the covariance
 _RIVALS = 4  # runner-ups worth a number on the map
 
 Pose = Float[Array, "3"] | Float[np.ndarray, "3"]
-
-
-def plot_world(
-    ax: Axes, world: OccupancyGrid | PolygonMap
-) -> AxesImage | LineCollection:
-    """The map: walls dark, free space white, unknown space grey; frames the axes on it.
-
-    The frame holds what is free and a margin, however much of the picture is unknown.
-
-    Returns:
-        The image of a grid, or the lines of a polygon map.
-    """
-    ax.set_aspect("equal")
-    if isinstance(world, PolygonMap):
-        _frame(ax, np.concatenate([world.start, world.end]))
-        return _segments(ax, world.start, world.end, colors=WALL, linewidths=1.2)
-
-    x, y, yaw = np.asarray(world.origin, float)
-    to_map = Affine2D().scale(float(world.resolution)).rotate(yaw).translate(x, y)
-    height, width = world.cells.shape
-    image = ax.imshow(
-        _colours(np.asarray(world.cells)),
-        origin="lower",
-        extent=(0, width, 0, height),
-        transform=to_map + ax.transData,
-        interpolation_stage="rgba",
-        zorder=0,
-    )
-    ax.set_facecolor(UNKNOWN)  # beyond the map
-    _frame(ax, to_map.transform(_known_cells(world)))
-    return image
 
 
 def plot_scan(
@@ -88,8 +58,13 @@ def plot_scan(
     Returns:
         The rays and the end points; rays that met nothing are left out.
     """
-    points = np.asarray(_points_on_map(pose, scan))[np.asarray(scan.echo)]
-    start = np.broadcast_to(np.asarray(pose[:2]), points.shape)
+    # In NumPy: a program for so little would take longer to load than to draw.
+    x, y, theta = np.asarray(pose, float)
+    echo = np.asarray(scan.echo)
+    turned = np.asarray(scan.bearings, float)[echo] + theta
+    ahead = np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    start = np.broadcast_to([x, y], ahead.shape)
+    points = start + np.asarray(scan.ranges, float)[echo, None] * ahead
     rays = _segments(ax, start, points, colors=SCAN, linewidths=0.4, alpha=0.2)
     ends = ax.scatter(*points.T, s=2.5, color=SCAN, linewidths=0, zorder=3)
     return rays, ends
@@ -178,7 +153,7 @@ def plot_localisation(
     reach = np.clip(np.nan_to_num(4.5 * spread[:2].max()), 0.005, 2.0)
     if truth is not None:
         error = float(np.hypot(*(truth - result.pose)[:2]))
-        right = error < _MARGIN
+        right = error < _NEAR
         reach = max(reach, 1.5 * error) if right else reach
         plot_pose(close if right else ax, truth, TRUTH, 12, "truth")
     for view in (ax, room):
@@ -203,39 +178,11 @@ def plot_localisation(
     return [ax, room, close]
 
 
-@jax.jit
-def _points_on_map(pose, scan):
-    return transform_points(pose, scan.points)
-
-
 def _segments(ax: Axes, start: ArrayLike, end: ArrayLike, **style) -> LineCollection:
     """Straight lines from each start to its end."""
     lines = LineCollection(list(np.stack([start, end], axis=1)), **style)
     ax.add_collection(lines)
     return lines
-
-
-def _colours(cells: np.ndarray) -> np.ndarray:
-    """Red, green, blue of each cell: white to wall colour by occupancy, or unknown."""
-    share = np.clip(cells, 0, 100)[..., None] / 100
-    known = 1 + share * (np.array(to_rgb(WALL)) - 1)
-    colours = np.where(cells[..., None] < 0, to_rgb(UNKNOWN), known)
-    return np.rint(255 * colours).astype(np.uint8)
-
-
-def _frame(ax: Axes, points: np.ndarray) -> None:
-    """Limits that hold all points [m] and a margin."""
-    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-
-
-def _known_cells(world: OccupancyGrid) -> np.ndarray:
-    """(column, row) of free cells, without rows and columns that hold stray beams."""
-    free = np.asarray(world.free)
-    least = _MARGIN / float(world.resolution)
-    columns, rows = (free.sum(axis=axis) >= least for axis in (0, 1))
-    known = np.argwhere(free & columns & rows[:, None])
-    return (known if known.size else np.argwhere(free | True))[:, ::-1] + 0.5
 
 
 def _views(ax: Axes) -> tuple[Axes, Axes]:

@@ -11,7 +11,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 
 from fsmsm_jax.localisation.lidar_odometry import LidarOdometry
-from fsmsm_jax.plotting.localisation import POSE, RIVAL, SCAN, TRUTH, WALL
+from fsmsm_jax.plotting.colours import POSE, RIVAL, SCAN, TRUTH, WALL
 
 __all__ = ["plot_odometry"]
 

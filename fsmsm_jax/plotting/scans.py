@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
 
-from fsmsm_jax.plotting.localisation import POSE, WALL
+from fsmsm_jax.plotting.colours import POSE, WALL
 from fsmsm_jax.world.polygons import PolygonMap
 
 __all__ = ["SeenSpaceArtists", "plot_seen_space"]

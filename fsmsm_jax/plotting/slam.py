@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.container import BarContainer, ErrorbarContainer
 
-from fsmsm_jax.plotting.localisation import INK, POSE, RIVAL, SCAN, TRUTH, UNKNOWN
+from fsmsm_jax.plotting.colours import INK, POSE, RIVAL, SCAN, TRUTH, UNKNOWN
 from fsmsm_jax.slam.landmarks import Landmarks
 
 __all__ = ["SLAM_COLOURS", "plot_particle_errors", "plot_run_times", "plot_slam"]

@@ -16,7 +16,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from fsmsm_jax.plotting.localisation import INK, POSE, RIVAL, SCAN, TRUTH
+from fsmsm_jax.plotting.colours import INK, POSE, RIVAL, SCAN, TRUTH
 
 __all__ = [
     "plot_caer",

@@ -15,16 +15,9 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 
 from fsmsm_jax.localisation.track import Track
-from fsmsm_jax.plotting.localisation import (
-    DOUBT,
-    INK,
-    POSE,
-    RIVAL,
-    SCAN,
-    TRUTH,
-    plot_pose,
-    plot_world,
-)
+from fsmsm_jax.plotting.colours import DOUBT, INK, POSE, RIVAL, SCAN, TRUTH
+from fsmsm_jax.plotting.localisation import plot_pose
+from fsmsm_jax.plotting.world import plot_world
 from fsmsm_jax.world.occupancy import OccupancyGrid
 from fsmsm_jax.world.polygons import PolygonMap
 

@@ -22,7 +22,7 @@ from thesis.report import Table, number, save
 
 from fsmsm_jax import geometry
 from fsmsm_jax.evaluation.slam import Consistency, chi2_bounds, consistency
-from fsmsm_jax.plotting.localisation import INK
+from fsmsm_jax.plotting.colours import INK
 from fsmsm_jax.plotting.slam import SLAM_COLOURS
 from fsmsm_jax.slam.filter import SlamConfig
 from fsmsm_jax.slam.methods import Name
