@@ -52,6 +52,7 @@ from fsmsm_jax.alignment.fit import (
 from fsmsm_jax.alignment.information import (
     Directions as Directions,
     covariance as covariance,
+    covariance_root as covariance_root,
     cramer_rao_bound as cramer_rao_bound,
     degenerate_directions as degenerate_directions,
     fisher_information as fisher_information,

@@ -3,9 +3,9 @@
 The lattice of the search is coarse, and its poses stand up to half a spacing and half a
 step of heading beside the truth. They all descend onto the walls with few rays, the
 better half of them farther; what fits best there descends again with more; distinct
-places are polished by their ranges on the exact derivative. At each step fewer
-candidates are left and more rays judge them. All counts are fixed (`SearchConfig`), so
-one compilation serves every scan of a sensor.
+places are polished by their ranges on the exact derivative, the best of them by both
+witnesses in turn. At each step fewer candidates are left and more rays judge them. All
+counts are fixed (`SearchConfig`), so one compilation serves every scan of a sensor.
 """
 
 from typing import NamedTuple
