@@ -105,8 +105,10 @@ def test_a_wrong_map_gets_no_finish_by_ranges(places):
     """No thickness is estimated then, and the pose is what end points know of it."""
     world, poses, scans = places
     scan = part(scans, 0)
-    ask = lambda usual: one(world, scan, poses[0], LOOSE, jnp.asarray(usual))
-    sharp, barely, off = ask(0.01), ask(0.1999), ask(0.2001)
+    ask = lambda usual, wrong: one(
+        world, scan, poses[0], LOOSE, jnp.asarray(usual), CorrectionConfig(wrong=wrong)
+    )
+    sharp, barely, off = ask(0.01, 0.2), ask(0.19, 0.1901), ask(0.19, 0.1899)
     # Another blur may choose another of the descents that ended at this place.
     for a, b in zip(sharp, barely, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
