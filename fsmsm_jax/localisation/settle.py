@@ -183,13 +183,11 @@ def _reconsider(world, scan, found, scales) -> tuple[Array, Array, Evidence]:
 
     Either witness stops in valleys of its own, the other leads out of many of them.
     """
-    scales = jnp.array(scales)
-    descend = lambda pose: descend_end_points(world, scan, pose, scales)
+    descend = lambda pose: descend_end_points(world, scan, pose, jnp.array(scales))
     poses = jax.vmap(descend)(found[0])
-    polish = lambda pose: polish_ranges(world, scan, pose, scales)
-    polished, thickness = jax.vmap(polish)(poses)
-    for other in (poses, None), (polished, thickness):
-        other = other[0], *_judge(world, scan, *other)
+    by_ends = poses, *_judge(world, scan, poses)
+    by_ranges = _polish(world, scan, by_ends, scales)
+    for other in by_ends, by_ranges:
         found = _choose(other[1] > found[1], other, found)
     return found
 

@@ -23,7 +23,6 @@ from fsmsm_jax.plotting.localisation import (
     plot_pose as plot_pose,
     plot_scan as plot_scan,
 )
-from fsmsm_jax.plotting.world import plot_world as plot_world
 from fsmsm_jax.plotting.scans import (
     SeenSpaceArtists as SeenSpaceArtists,
     plot_seen_space as plot_seen_space,
@@ -50,3 +49,4 @@ from fsmsm_jax.plotting.slam import (
     plot_slam as plot_slam,
 )
 from fsmsm_jax.plotting.benchmark import plot_scaling as plot_scaling
+from fsmsm_jax.plotting.world import plot_world as plot_world

@@ -75,4 +75,4 @@ def _known_cells(world: OccupancyGrid) -> np.ndarray:
     least = _MARGIN / float(world.resolution)
     columns, rows = (free.sum(axis=axis) >= least for axis in (0, 1))
     known = np.argwhere(free & columns & rows[:, None])
-    return (known if known.size else np.argwhere(free | True))[:, ::-1] + 0.5
+    return (known if known.size else np.argwhere(np.ones_like(free)))[:, ::-1] + 0.5
